@@ -1,0 +1,76 @@
+"""Key expressions: build and parse.
+
+{realm}/v1/local/{source}/tracks|intensity|info|alive
+{realm}/v1/global/{centre}/tracks|log|status|alive|picture|orders
+{realm}/v1/truth/{scenario}
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+__all__ = ["REALM", "Key", "check_name", "check_realm", "global_key", "local_key", "parse_key", "truth_key"]
+
+REALM = "fusion"
+VERSION = "v1"
+LOCAL = ("tracks", "intensity", "info", "alive")
+GLOBAL = ("tracks", "log", "status", "alive", "picture", "orders")
+_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}\Z")
+
+
+@dataclass(frozen=True, slots=True)
+class Key:
+    """A parsed key: scope `local`, `global` or `truth`; `what` is "" for truth."""
+
+    realm: str
+    scope: str
+    name: str
+    what: str
+
+
+def check_name(name: str) -> str:
+    """Return `name` if it can stand in a key: 1 to 64 letters, digits, `_.:-`, beginning with a letter or digit."""
+    if not _NAME.match(name):
+        raise ValueError(f"bad name {name!r}: use 1 to 64 letters, digits or _ . : - and begin with a letter or digit")
+    return name
+
+
+def check_realm(realm: str) -> str:
+    """Return `realm` if every chunk between its slashes is a name other than `v1`."""
+    for chunk in realm.split("/"):
+        check_name(chunk)
+        if chunk == VERSION:
+            raise ValueError(f"bad realm {realm!r}: {VERSION} stands for the version")
+    return realm
+
+
+def local_key(source: str, what: str, realm: str = REALM) -> str:
+    """Key of a source; `what` is tracks, intensity, info or alive. `*` stands for any source."""
+    if what not in LOCAL:
+        raise ValueError(f"no local key {what!r} (known: {' '.join(LOCAL)})")
+    return f"{check_realm(realm)}/{VERSION}/local/{source if source == '*' else check_name(source)}/{what}"
+
+
+def global_key(centre: str, what: str, realm: str = REALM) -> str:
+    """Key of a centre; `what` is tracks, log, status, alive, picture or orders. `*` stands for any centre."""
+    if what not in GLOBAL:
+        raise ValueError(f"no global key {what!r} (known: {' '.join(GLOBAL)})")
+    return f"{check_realm(realm)}/{VERSION}/global/{centre if centre == '*' else check_name(centre)}/{what}"
+
+
+def truth_key(scenario: str, realm: str = REALM) -> str:
+    """Key of a scenario's truth. `*` stands for any scenario."""
+    return f"{check_realm(realm)}/{VERSION}/truth/{scenario if scenario == '*' else check_name(scenario)}"
+
+
+def parse_key(key: str) -> Key:
+    """The parts of a key; `ValueError` for anything that is not one of ours."""
+    chunks = key.split("/")
+    if len(chunks) >= 4 and chunks[-3:-1] == [VERSION, "truth"]:
+        return Key(check_realm("/".join(chunks[:-3])), "truth", check_name(chunks[-1]), "")
+    if len(chunks) >= 5 and chunks[-4] == VERSION:
+        scope, name, what = chunks[-3:]
+        if what in {"local": LOCAL, "global": GLOBAL}.get(scope, ()):
+            return Key(check_realm("/".join(chunks[:-4])), scope, check_name(name), what)
+    raise ValueError(f"not a key of this version: {key!r}")

@@ -1,0 +1,1 @@
+"""Clients of the fusion centre: the publishing kit, local trackers, simulated and recorded sensors."""
