@@ -1,0 +1,269 @@
+"""Small symmetric matrices, many at once: the batch is the last axis.
+
+A batch of matrices is `(n, n, B)`, a batch of vectors `(n, B)`. Loops run in Python over the n
+indices and in NumPy over the batch, so each operation is a handful of passes over contiguous rows.
+Further batch axes are welcome: wherever `B` is written, `(..., B)` works too.
+
+What callers may rely on:
+
+* An element's result is the same, bit for bit, whatever batch surrounds it. Only element-wise ufuncs
+  are used: no BLAS, and no reduction over an axis (NumPy orders those by shape).
+* A bad element (indefinite, NaN) yields NaN, inf or a meaningless number of its own, and neither warns
+  nor raises nor spoils its neighbours. Ask `is_positive_definite`.
+* Functions of a symmetric P read its lower triangle only; what they return is exactly symmetric.
+* float64 in, float64 out; longdouble in, longdouble out.
+
+The factorisation is P = L D L' without pivoting, which for a positive definite P is stable and
+indifferent to the scale of each component (metres beside radians per second): its error is governed by
+the condition of the correlation matrix, not of P.
+"""
+
+from collections.abc import Iterator
+from math import prod
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = [
+    "blocks",
+    "congruence",
+    "det",
+    "inverse",
+    "inverse_det",
+    "is_positive_definite",
+    "ldl",
+    "logdet",
+    "matvec",
+    "outer",
+    "quadratic",
+    "solve",
+    "symmetrise",
+    "to_first",
+    "to_last",
+]
+
+FloatArray = NDArray[np.float64]
+
+CACHE_BYTES = 1 << 19
+"""What one block's (n, n, B) array may occupy: half a megabyte, some 4,000 matrices at n = 4."""
+
+
+def to_last(a: FloatArray, core: int) -> FloatArray:
+    """Flatten the leading batch axes of `a` and move them last: (..., *core axes) -> (*core axes, B).
+
+    `core` is the number of trailing axes that make one element (1: vectors, 2: matrices). Contiguous copy.
+    """
+    a = np.asarray(a, dtype=np.float64)
+    batch, shape = a.shape[: a.ndim - core], a.shape[a.ndim - core :]
+    size, entries = prod(batch), prod(shape)
+    out = np.empty((*shape, size))
+    out.reshape(entries, size)[...] = a.reshape(size, entries).T
+    return out
+
+
+def to_first(a: FloatArray, batch: tuple[int, ...], core: int) -> FloatArray:
+    """The inverse of `to_last`: (*core axes, B) -> (*batch, *core axes), a contiguous copy."""
+    shape = a.shape[:core]
+    size, entries = prod(batch), prod(shape)
+    out = np.empty((*batch, *shape))
+    out.reshape(size, entries)[...] = a.reshape(entries, size).T
+    return out
+
+
+def blocks(n: int, size: int) -> Iterator[slice]:
+    """Slices that cut a batch of `size` n x n matrices into pieces whose working set stays in the cache."""
+    step = max(256, CACHE_BYTES // (8 * n * n))
+    return (slice(i, min(i + step, size)) for i in range(0, size, step))
+
+
+def inverse(P: FloatArray) -> FloatArray:
+    """P^-1 (n, n, B) of symmetric positive definite P."""
+    return inverse_det(P)[0]
+
+
+def inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """P^-1 (n, n, B) and det P (B,) in one elimination (Gauss-Jordan sweeps on the lower triangle)."""
+    n, batch = P.shape[0], P.shape[2:]
+    flat = P.reshape(n, n, -1)
+    out, det_out = np.empty_like(flat), np.empty_like(flat[0, 0])
+    with np.errstate(all="ignore"):
+        for part in blocks(n, flat.shape[2]):
+            det_out[part] = _sweep(flat[:, :, part], out[:, :, part])
+    return out.reshape(n, n, *batch), det_out.reshape(batch)
+
+
+def _sweep(P: FloatArray, out: FloatArray) -> FloatArray:
+    n = P.shape[0]
+    A = np.empty(P.shape, P.dtype)
+    for i in range(n):
+        A[i, : i + 1] = P[i, : i + 1]
+    column = np.empty_like(A[0])
+    scratch = np.empty_like(column)
+    product: FloatArray = np.ones_like(A[0, 0])
+    for k in range(n):
+        column[:k] = A[k, :k]
+        column[k + 1 :] = A[k + 1 :, k]
+        column[k] = 0.0
+        product *= A[k, k]
+        pivot = 1.0 / A[k, k]
+        row = column * pivot
+        for i in range(n):
+            if i == k:
+                continue
+            np.multiply(row[: i + 1], column[i], out=scratch[: i + 1])
+            A[i, : i + 1] -= scratch[: i + 1]
+        A[k, :k] = row[:k]
+        A[k + 1 :, k] = row[k + 1 :]
+        np.negative(pivot, out=A[k, k])
+    for i in range(n):
+        np.negative(A[i, : i + 1], out=out[i, : i + 1])
+        out[:i, i] = out[i, :i]
+    return product
+
+
+def ldl(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Factors of P = L diag(d) L': unit lower triangular L (n, n, B) and pivots d (n, B)."""
+    n = P.shape[0]
+    L = np.zeros(P.shape, P.dtype)
+    d = np.empty(P.shape[1:], P.dtype)
+    with np.errstate(all="ignore"):
+        A = np.array(P)
+        for k in range(n):
+            d[k] = A[k, k]
+            L[k, k] = 1.0
+            L[k + 1 :, k] = A[k + 1 :, k] / d[k]
+            for i in range(k + 1, n):
+                A[i, k + 1 : i + 1] -= L[i, k] * A[k + 1 : i + 1, k]
+    return L, d
+
+
+def _pivots(P: FloatArray) -> FloatArray:
+    n = P.shape[0]
+    A = np.array(P)
+    d = np.empty(P.shape[1:], P.dtype)
+    for k in range(n):
+        d[k] = A[k, k]
+        if k + 1 < n:
+            pivot = 1.0 / d[k]
+            for i in range(k + 1, n):
+                A[i, k + 1 : i + 1] -= (A[i, k] * pivot) * A[k + 1 : i + 1, k]
+    return d
+
+
+def det(P: FloatArray) -> FloatArray:
+    """det P (B,), as the product of the pivots."""
+    with np.errstate(all="ignore"):
+        d = _pivots(P)
+        product: FloatArray = d[0].copy()
+        for k in range(1, len(d)):
+            product *= d[k]
+    return product
+
+
+def logdet(P: FloatArray) -> FloatArray:
+    """log det P (B,); NaN where a pivot is negative, -inf where one is zero."""
+    with np.errstate(all="ignore"):
+        logs = np.log(_pivots(P))
+        total: FloatArray = logs[0].copy()
+        for k in range(1, len(logs)):
+            total += logs[k]
+    return total
+
+
+def solve(P: FloatArray, x: FloatArray) -> FloatArray:
+    """P^-1 x (n, B) for x (n, B)."""
+    n = P.shape[0]
+    L, d = ldl(P)
+    with np.errstate(all="ignore"):
+        y = _forward(L, x)
+        y /= d
+        for k in range(n - 1, 0, -1):
+            y[:k] -= L[k, :k] * y[k]
+    return y
+
+
+def quadratic(P: FloatArray, x: FloatArray) -> FloatArray:
+    """x' P^-1 x (B,) for x (n, B): the squared Mahalanobis distance."""
+    L, d = ldl(P)
+    with np.errstate(all="ignore"):
+        y = _forward(L, x)
+        y *= y
+        y /= d
+        total: FloatArray = y[0].copy()
+        for k in range(1, len(y)):
+            total += y[k]
+    return total
+
+
+def _forward(L: FloatArray, x: FloatArray) -> FloatArray:
+    y = np.array(np.broadcast_to(x, L.shape[1:]), dtype=L.dtype)
+    for k in range(len(y) - 1):
+        y[k + 1 :] -= L[k + 1 :, k] * y[k]
+    return y
+
+
+def is_positive_definite(P: FloatArray, tolerance: float = 1e-14) -> NDArray[np.bool_]:
+    """Which P are numerically positive definite, (B,).
+
+    Every pivot must exceed `tolerance` times its diagonal entry, that is, 1 minus the squared multiple
+    correlation of a component with those before it must be told from zero. Independent of the units of
+    each component. NaN and infinity give False. The symmetry of P is not looked at.
+    """
+    with np.errstate(all="ignore"):
+        d = _pivots(P)
+        good: NDArray[np.bool_] = np.ones(P.shape[2:], dtype=np.bool_)
+        for k in range(len(d)):
+            good &= d[k] > tolerance * P[k, k]
+            good &= d[k] > 0.0
+            good &= np.isfinite(d[k])
+    return good
+
+
+def symmetrise(P: FloatArray) -> FloatArray:
+    """(P + P') / 2."""
+    out: FloatArray = 0.5 * (P + P.swapaxes(0, 1))
+    return out
+
+
+def matvec(A: FloatArray, x: FloatArray) -> FloatArray:
+    """A x, (m, B): x (n, B), A (m, n, B), or one A (m, n) for the whole batch."""
+    if A.ndim == 2:
+        A = A.reshape(*A.shape, *(1,) * (x.ndim - 1))
+    with np.errstate(all="ignore"):
+        out: FloatArray = A[:, 0] * x[0]
+        for k in range(1, A.shape[1]):
+            out += A[:, k] * x[k]
+    return out
+
+
+def outer(x: FloatArray, y: FloatArray) -> FloatArray:
+    """x y', (m, n, B), for x (m, B) and y (n, B)."""
+    out: FloatArray = x[:, None] * y[None, :]
+    return out
+
+
+def congruence(F: FloatArray, P: FloatArray) -> FloatArray:
+    """F P F' (m, m, B), exactly symmetric: P (n, n, B), F (m, n, B), or one F (m, n) for the whole batch.
+
+    Zeros of a shared F are skipped, so a sparse transition matrix is cheap.
+    """
+    m, n = F.shape[:2]
+    shared = F.ndim == 2
+    half = np.zeros((m, *P.shape[1:]), P.dtype)
+    out = np.zeros((m, m, *P.shape[2:]), P.dtype)
+    with np.errstate(all="ignore"):
+        for i in range(m):
+            for k in range(n):
+                if not (shared and F[i, k] == 0.0):
+                    half[i] += F[i, k] * P[k]
+        for i in range(m):
+            if shared:
+                for j in range(i + 1):
+                    for k in range(n):
+                        if F[j, k] != 0.0:
+                            out[i, j] += F[j, k] * half[i, k]
+            else:
+                for k in range(n):
+                    out[i, : i + 1] += F[: i + 1, k] * half[i, k]
+            out[:i, i] = out[i, :i]
+    return out
