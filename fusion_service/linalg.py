@@ -29,7 +29,6 @@ __all__ = [
     "congruence",
     "det",
     "inverse",
-    "inverse_det",
     "is_positive_definite",
     "ldl",
     "logdet",
@@ -37,6 +36,7 @@ __all__ = [
     "outer",
     "quadratic",
     "solve",
+    "sweep",
     "symmetrise",
     "to_first",
     "to_last",
@@ -70,42 +70,49 @@ def to_first(a: FloatArray, batch: tuple[int, ...], core: int) -> FloatArray:
     return out
 
 
-def blocks(n: int, size: int) -> Iterator[slice]:
-    """Slices that cut a batch of `size` n x n matrices into pieces whose working set stays in the cache."""
-    step = max(256, CACHE_BYTES // (8 * n * n))
+def blocks(n: int, size: int, copies: int = 1) -> Iterator[slice]:
+    """Slices that cut a batch of `size` elements, each of `copies` n x n matrices, into pieces for the cache."""
+    step = max(256, CACHE_BYTES // (8 * n * n * copies))
     return (slice(i, min(i + step, size)) for i in range(0, size, step))
 
 
 def inverse(P: FloatArray) -> FloatArray:
     """P^-1 (n, n, B) of symmetric positive definite P."""
-    return inverse_det(P)[0]
+    return sweep(P)[0]
 
 
-def inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """P^-1 (n, n, B) and det P (B,) in one elimination (Gauss-Jordan sweeps on the lower triangle)."""
+def sweep(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """P^-1 (n, n, B), det P (B,) and margin (B,) in one elimination (Gauss-Jordan on the lower triangle).
+
+    The margin is the smallest pivot relative to its diagonal entry, NaN or negative for a bad matrix:
+    `margin > tolerance` is `is_positive_definite(P, tolerance)`.
+    """
     n, batch = P.shape[0], P.shape[2:]
-    flat = P.reshape(n, n, -1)
-    out, det_out = np.empty_like(flat), np.empty_like(flat[0, 0])
+    flat = P.reshape(n, n, prod(batch))
+    out, det_out, margin = np.empty_like(flat), np.empty_like(flat[0, 0]), np.empty_like(flat[0, 0])
     with np.errstate(all="ignore"):
         for part in blocks(n, flat.shape[2]):
-            det_out[part] = _sweep(flat[:, :, part], out[:, :, part])
-    return out.reshape(n, n, *batch), det_out.reshape(batch)
+            _sweep(flat[:, :, part], out[:, :, part], det_out[part], margin[part])
+    return out.reshape(n, n, *batch), det_out.reshape(batch), margin.reshape(batch)
 
 
-def _sweep(P: FloatArray, out: FloatArray) -> FloatArray:
+def _sweep(P: FloatArray, out: FloatArray, product: FloatArray, margin: FloatArray) -> None:
     n = P.shape[0]
+    product[...] = 1.0
+    margin[...] = P[0, 0] / np.abs(P[0, 0])
     A = np.empty(P.shape, P.dtype)
     for i in range(n):
         A[i, : i + 1] = P[i, : i + 1]
     column = np.empty_like(A[0])
     scratch = np.empty_like(column)
-    product: FloatArray = np.ones_like(A[0, 0])
     for k in range(n):
         column[:k] = A[k, :k]
         column[k + 1 :] = A[k + 1 :, k]
         column[k] = 0.0
         product *= A[k, k]
         pivot = 1.0 / A[k, k]
+        if k:
+            np.minimum(margin, A[k, k] / np.abs(P[k, k]), out=margin)
         row = column * pivot
         for i in range(n):
             if i == k:
@@ -118,7 +125,6 @@ def _sweep(P: FloatArray, out: FloatArray) -> FloatArray:
     for i in range(n):
         np.negative(A[i, : i + 1], out=out[i, : i + 1])
         out[:i, i] = out[i, :i]
-    return product
 
 
 def ldl(P: FloatArray) -> tuple[FloatArray, FloatArray]:

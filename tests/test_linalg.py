@@ -50,7 +50,7 @@ def test_against_numpy(case: tuple[int, Array, Array]) -> None:
     p, v = linalg.to_last(P, 2), linalg.to_last(x, 1)
     close = {"rtol": 1e-10, "atol": 1e-10}
     want = np.linalg.inv(P)
-    inverse, det = linalg.inverse_det(p)
+    inverse, det, _ = linalg.sweep(p)
     np.testing.assert_allclose(linalg.to_first(inverse, (40,), 2), want, **close)
     np.testing.assert_array_equal(inverse, inverse.swapaxes(0, 1))
     np.testing.assert_array_equal(linalg.inverse(p), inverse)
@@ -127,7 +127,10 @@ def test_a_bad_matrix_spoils_only_itself(name: str, value: float) -> None:
 
 def test_positive_definite_means_numerically_so() -> None:
     def ask(P: Array) -> bool:
-        return bool(linalg.is_positive_definite(np.asarray(P, dtype=float)[..., None])[0])
+        p = np.asarray(P, dtype=float)[..., None]
+        answer = bool(linalg.is_positive_definite(p)[0])
+        assert answer == (linalg.sweep(p)[2][0] > 1e-14)
+        return answer
 
     assert ask(np.eye(3))
     assert ask(np.diag([1e-150, 1.0, 1e150]))  # units do not matter
