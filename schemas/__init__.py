@@ -1,6 +1,7 @@
 """What crosses the bus: state spaces, messages, codec, key expressions. WIRE.md says it in words."""
 
-from schemas.codec import MAX_BYTES, VERSION, MessageError, decode, digest, encode, pack_lower, unpack_lower
+from schemas.codec import MAX_BYTES, VERSION, decode, digest, encode
+from schemas.errors import REASONS, MessageError
 from schemas.keys import REALM, Key, check_name, check_realm, global_key, local_key, parse_key, truth_key
 from schemas.messages import (
     DECISIONS,
@@ -32,6 +33,7 @@ from schemas.spaces import (
     Sector,
     check_space,
 )
+from schemas.values import pack_lower, unpack_lower
 
 __all__ = [
     "COMPONENTS",
@@ -40,6 +42,7 @@ __all__ = [
     "MAX_BYTES",
     "ORIGINS",
     "REALM",
+    "REASONS",
     "STATUSES",
     "VERSION",
     "Coverage",

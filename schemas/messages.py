@@ -29,6 +29,7 @@ __all__ = [
     "KEPT",
     "LINKED",
     "MERGED",
+    "NO_SOURCE",
     "ORIGINS",
     "SPLIT",
     "STATUSES",
@@ -69,6 +70,8 @@ DECISIONS = (
     "deleted",
 )
 LINKED, KEPT, BROKEN, GATE_FAILED, MERGED, SPLIT, BORN, CONFIRMED_NOW, COASTING_NOW, DELETED = range(10)
+NO_SOURCE = 65535
+"""The `source` of a decision that concerns no local track."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -201,8 +204,8 @@ class Entry:
 @dataclass(frozen=True, slots=True, eq=False)
 class Decisions:
     """Decisions of one step as K rows: kind u8 (index into `DECISIONS`), track u64 (global id),
-    source u16 (index into the log's `sources`), epoch u64, id u64 (local id), other u64 (another global
-    id), value f64 (the statistic it rests on, NaN where there is none)."""
+    source u16 (index into the log's `sources`, or `NO_SOURCE`), epoch u64, id u64 (local id), other u64
+    (another global id, 0: none), value f64 (the statistic it rests on, NaN where there is none)."""
 
     kind: U8
     track: U64

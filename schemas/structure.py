@@ -1,0 +1,151 @@
+"""Whether the columns of a message fit together, and their shapes.
+
+Each function gets the values read by the tables, gives columns their shape in place, and raises `MessageError`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from schemas.errors import MessageError
+from schemas.messages import (
+    DECISIONS,
+    NO_SOURCE,
+    STATUSES,
+    U64,
+    Decisions,
+    GlobalTracks,
+    LocalIntensity,
+    LocalTracks,
+    Message,
+    SensorInfo,
+    Status,
+    StepLog,
+    Truth,
+)
+from schemas.spaces import Ecef, Polygon
+from schemas.tables import DECISION_COLUMNS
+from schemas.values import unpack_lower
+
+__all__ = ["SHAPE"]
+
+Values = dict[str, Any]
+
+
+def _lengths(values: Values, length: int, *names: str) -> None:
+    for name in names:
+        column = values[name]
+        if column is not None and len(column) != length:
+            raise MessageError("length", f"{name} has {len(column)} numbers where {length} belong")
+
+
+def _unique(ids: U64) -> None:
+    if len(ids) <= 64:
+        twice = len(set(ids.tolist())) != len(ids)
+    else:
+        ordered = np.sort(ids)
+        twice = bool((ordered[1:] == ordered[:-1]).any())
+    if twice:
+        raise MessageError("bad-field", "ids: one stands twice")
+
+
+def _densities(values: Values, components: int) -> None:
+    n = len(values["space"])
+    triangle = n * (n + 1) // 2
+    means, packed = values["means"], values["covariances"]
+    if len(means) != components * n or len(packed) != components * triangle:
+        _lengths(values, components * n, "means")
+        _lengths(values, components * triangle, "covariances")
+    values["means"] = means.reshape(components, n)
+    values["covariances"] = covariances = unpack_lower(packed.reshape(components, triangle), n)
+    covariances.flags.writeable = False
+
+
+def _components(values: Values, tracks: int) -> int:
+    counts, weights = values["counts"], values["weights"]
+    if counts is None:
+        _lengths(values, tracks, "weights")
+        return tracks
+    _lengths(values, tracks, "counts")
+    if weights is None:
+        raise MessageError("missing", "counts without weights")
+    if tracks and counts.min() == 0:
+        raise MessageError("bad-field", "counts: a track without components")
+    total = int(counts.sum(dtype=np.int64))
+    _lengths(values, total, "weights")
+    return total
+
+
+def _local(values: Values) -> None:
+    ids = values["ids"]
+    _unique(ids)
+    _lengths(values, len(ids), "existence", "updated", "identity", "kind", "kind_p")
+    _densities(values, _components(values, len(ids)))
+
+
+def _intensity(values: Values) -> None:
+    _densities(values, len(values["weights"]))
+
+
+def _info(values: Values) -> None:
+    if isinstance(values["coverage"], Polygon) and isinstance(values["frame"], Ecef):
+        raise MessageError("bad-field", "coverage: a polygon needs a frame with a horizontal plane, not ecef")
+    packed = values["position_covariance"]
+    if packed is None:
+        return
+    _lengths(values, 6, "position_covariance")
+    covariance = unpack_lower(packed, 3)
+    if not np.isfinite(covariance).all() or np.linalg.eigvalsh(covariance)[0] < -1e-9 * np.abs(covariance).max():
+        raise MessageError("bad-field", "position_covariance: not finite and positive semidefinite")
+    covariance.flags.writeable = False
+    values["position_covariance"] = covariance
+
+
+def _global(values: Values) -> None:
+    ids = values["ids"]
+    tracks = len(ids)
+    _unique(ids)
+    _lengths(values, tracks, "status", "existence", "updated", "contributor_counts")
+    contributions = int(values["contributor_counts"].sum(dtype=np.int64))
+    parts = ("source", "epoch", "id", "influence")
+    _lengths(values, contributions, *(f"contributor_{part}" for part in parts))
+    if contributions and values["contributor_source"].max() >= len(values["sources"]):
+        raise MessageError("bad-field", "contributor_source: beyond sources")
+    if tracks and values["status"].max() >= len(STATUSES):
+        raise MessageError("bad-field", f"status: beyond {len(STATUSES) - 1}")
+    _densities(values, _components(values, tracks))
+
+
+def _log(values: Values) -> None:
+    columns = {name: values.pop(f"decision_{name}") for name in DECISION_COLUMNS}
+    _lengths(columns, len(columns["kind"]), *columns)
+    if len(columns["kind"]) and columns["kind"].max() >= len(DECISIONS):
+        raise MessageError("bad-field", f"decision_kind: beyond {len(DECISIONS) - 1}")
+    if ((columns["source"] >= len(values["sources"])) & (columns["source"] != NO_SOURCE)).any():
+        raise MessageError("bad-field", f"decision_source: beyond sources (none is {NO_SOURCE})")
+    values["decisions"] = Decisions(**columns)
+
+
+def _truth(values: Values) -> None:
+    ids, n = values["ids"], len(values["space"])
+    _unique(ids)
+    _lengths(values, len(ids) * n, "means")
+    values["means"] = values["means"].reshape(len(ids), n)
+
+
+def _nothing(values: Values) -> None:
+    """A status has no columns."""
+
+
+SHAPE: dict[type[Message], Callable[[Values], None]] = {
+    LocalTracks: _local,
+    LocalIntensity: _intensity,
+    SensorInfo: _info,
+    GlobalTracks: _global,
+    StepLog: _log,
+    Status: _nothing,
+    Truth: _truth,
+}
