@@ -1,14 +1,17 @@
 """Numeric checks, run on the densities of many messages at once.
 
 A density is sound when its numbers are finite and within `MAX_MEAN` and `VARIANCES`, its covariance is
-positive definite (every pivot of the factorisation of the correlation matrix above `PIVOT`), its weights are
-not negative and sum to 1 per track (an intensity's only are not negative), and its existence is in [0, 1].
+positive definite (LDL' factorisation, every pivot above `PIVOT` times the variance it started from), its
+weights are not negative and sum to 1 per track (an intensity's only are finite and not negative), and its
+existence is in [0, 1]. Every operation is element by element over the batch, so that a message gets the same
+codes alone and among others.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from itertools import pairwise
+from itertools import accumulate, pairwise
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +21,7 @@ from schemas.messages import Floats, GlobalTracks, LocalIntensity, LocalTracks
 __all__ = ["FAULTS", "check_numbers"]
 
 FAULTS = ("", "not-finite", "out-of-range", "not-positive-definite", "weights", "existence")
-"""Reasons by the code that `check_numbers` gives; 0 is sound."""
+"""Reasons by the code that `check_numbers` gives; 0 is sound. The first that holds is given."""
 
 MAX_MEAN = 1e12
 VARIANCES = (1e-20, 1e24)
@@ -27,73 +30,96 @@ WEIGHT_SUM = 1e-6
 
 _FINITE, _RANGE, _DEFINITE, _WEIGHTS, _EXISTENCE = range(1, 6)
 
+Densities: TypeAlias = LocalTracks | LocalIntensity | GlobalTracks
+Codes: TypeAlias = NDArray[np.uint8]
 
-def check_numbers(messages: Sequence[LocalTracks | LocalIntensity | GlobalTracks]) -> list[NDArray[np.uint8]]:
+
+def check_numbers(messages: Sequence[Densities]) -> list[Codes]:
     """For each message one fault code (index into `FAULTS`) per track, or per component of an intensity.
 
-    All components of one state dimension are checked together; a bad one spoils no other.
+    A track of several components has the highest code of them. One bad component spoils no other track.
     """
-    faults: list[NDArray[np.uint8]] = [np.zeros(0, dtype=np.uint8)] * len(messages)
+    faults: list[Codes] = [np.zeros(0, dtype=np.uint8)] * len(messages)
     by_dimension: dict[int, list[int]] = {}
     for index, message in enumerate(messages):
-        by_dimension.setdefault(message.means.shape[-1], []).append(index)
-    for indices in by_dimension.values():
-        means = np.concatenate([messages[index].means for index in indices])
-        covariances = np.concatenate([messages[index].covariances for index in indices])
-        codes = _density_faults(means, covariances)
-        ends = np.cumsum([0, *(len(messages[index].means) for index in indices)])
-        for index, (low, high) in zip(indices, pairwise(ends), strict=True):
-            faults[index] = _track_faults(messages[index], codes[low:high])
+        by_dimension.setdefault(message.means.shape[1], []).append(index)
+    with np.errstate(all="ignore"):
+        for indices in by_dimension.values():
+            means = [messages[index].means for index in indices]
+            codes = _density_faults(
+                np.concatenate(means), np.concatenate([messages[index].covariances for index in indices])
+            )
+            ends = accumulate(map(len, means), initial=0)
+            for index, (low, high) in zip(indices, pairwise(ends), strict=True):
+                faults[index] = codes[low:high]
+        _weight_faults(messages, faults)
+        _existence_faults(messages, faults)
     return faults
 
 
-def _density_faults(means: Floats, covariances: Floats) -> NDArray[np.uint8]:
+def _density_faults(means: Floats, covariances: Floats) -> Codes:
     codes = np.zeros(len(means), dtype=np.uint8)
-    variances = np.einsum("bii->bi", covariances)
-    with np.errstate(all="ignore"):
-        definite = _definite(covariances, variances)
-        in_range = (np.abs(means) <= MAX_MEAN).all(axis=1)
-        in_range &= ((variances >= VARIANCES[0]) & (variances <= VARIANCES[1])).all(axis=1)
-    codes[~definite] = _DEFINITE
-    codes[~in_range & (variances > 0).all(axis=1)] = _RANGE
-    codes[~(np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2)))] = _FINITE
+    bad = np.flatnonzero(~_sound(means, covariances))
+    if bad.size:
+        means, covariances = means[bad], covariances[bad]
+        variances = np.einsum("bii->bi", covariances)
+        outside = (np.abs(means) > MAX_MEAN).any(axis=1) | (variances > VARIANCES[1]).any(axis=1)
+        outside |= ((variances > 0) & (variances < VARIANCES[0])).any(axis=1)
+        finite = np.isfinite(means).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
+        codes[bad] = np.where(finite, np.where(outside, _RANGE, _DEFINITE), _FINITE)
     return codes
 
 
-def _definite(covariances: Floats, variances: Floats) -> NDArray[np.bool_]:
-    """Whether each correlation matrix has an LDL' factorisation with pivots above `PIVOT`."""
-    n = covariances.shape[-1]
-    scale = 1.0 / np.sqrt(variances)
-    rest = np.ascontiguousarray(np.moveaxis(covariances * scale[:, :, None] * scale[:, None, :], 0, -1))
-    good: NDArray[np.bool_] = np.all(variances > 0, axis=1)
+def _sound(means: Floats, covariances: Floats) -> NDArray[np.bool_]:
+    """True where numbers are in range and every pivot is large enough; NaN and infinity fail each comparison."""
+    n = means.shape[1]
+    good: NDArray[np.bool_] = np.all(np.abs(means.T) <= MAX_MEAN, axis=0)
+    rest = np.ascontiguousarray(covariances.reshape(len(means), n * n).T).reshape(n, n, -1)
     for k in range(n):
-        good &= rest[k, k] > PIVOT
+        variance = covariances[:, k, k]
+        pivot = rest[k, k]
+        good &= (variance >= VARIANCES[0]) & (variance <= VARIANCES[1]) & (pivot > PIVOT * variance)
         for i in range(k + 1, n):
-            factor = rest[i, k] / rest[k, k]
+            factor = rest[i, k] / pivot
             for j in range(k + 1, i + 1):
                 rest[i, j] -= factor * rest[j, k]
     return good
 
 
-def _track_faults(message: LocalTracks | LocalIntensity | GlobalTracks, codes: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    if isinstance(message, LocalIntensity):
-        bad = ~((message.weights >= 0) & np.isfinite(message.weights))
-        return np.where((codes == 0) & bad, np.uint8(_WEIGHTS), codes)
-    if message.weights is None:
-        faults = codes.copy()
-    else:
-        counts = np.ones(len(message.ids), dtype=np.intp) if message.counts is None else message.counts.astype(np.intp)
-        starts = np.cumsum(counts) - counts
-        if not len(counts):
-            return codes
-        faults = np.maximum.reduceat(codes, starts)
-        with np.errstate(all="ignore"):
-            total = np.add.reduceat(message.weights, starts)
-            sound = np.minimum.reduceat(message.weights, starts) >= 0
-            sound &= np.abs(total - 1.0) <= WEIGHT_SUM
-        faults[(faults == 0) & ~sound] = _WEIGHTS
-    if message.existence is not None:
-        with np.errstate(all="ignore"):
-            sound = (message.existence >= 0) & (message.existence <= 1)
-        faults[(faults == 0) & ~sound] = _EXISTENCE
-    return faults
+def _weight_faults(messages: Sequence[Densities], faults: list[Codes]) -> None:
+    """Mark bad weights in `faults`, whose codes are per component so far, and make them per track."""
+    mixtures, counts, weights = [], [], []
+    for index, message in enumerate(messages):
+        if isinstance(message, LocalIntensity):
+            sound = (message.weights >= 0) & np.isfinite(message.weights)
+            faults[index][(faults[index] == 0) & ~sound] = _WEIGHTS
+        elif message.weights is not None and len(message.ids):
+            mixtures.append(index)
+            counts.append(np.ones(len(message.ids), np.uint16) if message.counts is None else message.counts)
+            weights.append(message.weights)
+    if not mixtures:
+        return
+    count = np.concatenate(counts).astype(np.intp)
+    starts = np.cumsum(count) - count
+    weight = np.concatenate(weights)
+    codes = np.maximum.reduceat(np.concatenate([faults[index] for index in mixtures]), starts)
+    sound = np.minimum.reduceat(weight, starts) >= 0
+    sound &= np.abs(np.add.reduceat(weight, starts) - 1.0) <= WEIGHT_SUM
+    codes[(codes == 0) & ~sound] = _WEIGHTS
+    ends = accumulate(map(len, counts), initial=0)
+    for index, (low, high) in zip(mixtures, pairwise(ends), strict=True):
+        faults[index] = codes[low:high]
+
+
+def _existence_faults(messages: Sequence[Densities], faults: list[Codes]) -> None:
+    told: list[tuple[int, Floats]] = []
+    for index, message in enumerate(messages):
+        if not isinstance(message, LocalIntensity) and message.existence is not None:
+            told.append((index, message.existence))
+    if not told:
+        return
+    existence = np.concatenate([values for _, values in told])
+    if ((existence >= 0) & (existence <= 1)).all():
+        return
+    for index, values in told:
+        faults[index][(faults[index] == 0) & ~((values >= 0) & (values <= 1))] = _EXISTENCE
