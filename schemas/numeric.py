@@ -27,6 +27,8 @@ MAX_MEAN = 1e12
 VARIANCES = (1e-20, 1e24)
 PIVOT = 1e-14
 WEIGHT_SUM = 1e-6
+BLOCK = 2048
+"""Densities factorised at a time: what fits the cache."""
 
 _FINITE, _RANGE, _DEFINITE, _WEIGHTS, _EXISTENCE = range(1, 6)
 
@@ -59,7 +61,8 @@ def check_numbers(messages: Sequence[Densities]) -> list[Codes]:
 
 def _density_faults(means: Floats, covariances: Floats) -> Codes:
     codes = np.zeros(len(means), dtype=np.uint8)
-    bad = np.flatnonzero(~_sound(means, covariances))
+    blocks = [slice(start, start + BLOCK) for start in range(0, len(means), BLOCK)]
+    bad = np.flatnonzero(~np.concatenate([_sound(means[block], covariances[block]) for block in blocks or [slice(0)]]))
     if bad.size:
         means, covariances = means[bad], covariances[bad]
         variances = np.einsum("bii->bi", covariances)
