@@ -1,0 +1,28 @@
+"""Local trackers, batched over tracks (the batch axis is the last)."""
+
+from sensor_clients.filters.association import Association, associate, likelihood, update
+from sensor_clients.filters.measurement import (
+    STATE,
+    MeasurementModel,
+    Position,
+    Prediction,
+    RangeAzimuth,
+    predict_measurement,
+)
+from sensor_clients.filters.tracker import LocalTracker, Report, TrackerConfig
+
+__all__ = [
+    "STATE",
+    "Association",
+    "LocalTracker",
+    "MeasurementModel",
+    "Position",
+    "Prediction",
+    "RangeAzimuth",
+    "Report",
+    "TrackerConfig",
+    "associate",
+    "likelihood",
+    "predict_measurement",
+    "update",
+]

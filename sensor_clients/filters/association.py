@@ -1,0 +1,91 @@
+"""Which return belongs to which track, as probabilities, and the update that follows from them.
+
+A track is a Bernoulli: it exists with probability r and then has a Gaussian state. A return of track i is
+detected with probability p_i, has the density l_ij at return j; clutter and the first returns of unknown
+targets together have the intensity lambda_j (per unit of measurement space). The joint weights
+psi_ij = r_i p_i l_ij / ((1 - r_i p_i) lambda_j) have marginals under "a return has one source, a track one
+return" that loopy belief propagation finds (Williams and Lau 2014); they are exact for one track, or one
+return, or when the gated pairs form a tree. For one track they are the weights of PDA (r = 1) and of IPDA:
+
+    P(j) = psi_j / (1 + sum psi),   r' = sum_j P(j) + P(0) r (1-p) / (1 - r p)
+
+The updated density is moment-matched with the spread of the innovations (Bar-Shalom):
+
+    x' = x + K nu,  nu = sum_j b_j nu_j,   P' = P - (1 - b_0) K S K' + K [sum_j b_j nu_j nu_j' - nu nu'] K'
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from fusion_service import linalg
+from sensor_clients.filters.measurement import Floats, Prediction
+
+__all__ = ["Association", "associate", "likelihood", "update"]
+
+
+class Association(NamedTuple):
+    """existence (T,) after the scan; weights (T, M) of the returns given existence, missed (T,) of none of
+    them (each row sums to 1 with it); unused (M,): the probability that a return is of no track."""
+
+    existence: Floats
+    weights: Floats
+    missed: Floats
+    unused: Floats
+
+
+def likelihood(prediction: Prediction, gate: float) -> Floats:
+    """Density l_ij (T, M) of return j under track i, 0 beyond `gate` (squared Mahalanobis distance).
+
+    Divided by the probability 1 - exp(-gate/2) of the gate of a 2-D return, so that it integrates to 1.
+    """
+    nu, S = prediction.innovations, linalg.inverse(prediction.covariance)
+    distance = S[0, 0, :, None] * nu[0] ** 2 + 2 * S[0, 1, :, None] * nu[0] * nu[1] + S[1, 1, :, None] * nu[1] ** 2
+    scale = (2 * math.pi) * np.sqrt(linalg.det(prediction.covariance)) * (1 - math.exp(-gate / 2))
+    return np.where(distance < gate, np.exp(-0.5 * np.minimum(distance, gate)), 0.0) / scale[:, None]
+
+
+def associate(
+    densities: Floats, existence: Floats, detection: Floats, intensity: Floats, tolerance: float = 1e-6
+) -> Association:
+    """Marginal association probabilities by loopy belief propagation.
+
+    densities l (T, M), existence r (T,), detection p (T,) including the gate's probability, intensity of
+    what is not a track (M,). Iterates until no message changes by more than `tolerance` (relative).
+    """
+    T, M = densities.shape
+    if not T:
+        return Association(existence, np.zeros((0, M)), np.zeros(0), np.ones(M))
+    hit = np.minimum(existence * detection, 1 - 1e-12)
+    psi = (hit / (1 - hit))[:, None] * densities / intensity
+    nu = np.ones_like(psi)
+    for _ in range(200):
+        towards = psi * nu
+        mu = psi / (1 + towards.sum(axis=1, keepdims=True) - towards)
+        new = 1 / (1 + mu.sum(axis=0) - mu)
+        change = np.max(np.abs(new - nu), initial=0.0)
+        nu = new
+        if change < tolerance:
+            break
+    towards = psi * nu
+    total = 1 + towards.sum(axis=1)
+    taken = towards / total[:, None]
+    # What misses may still exist: only that part of P(0) is the existing track's own.
+    missed = existence * (1 - detection) / (1 - hit) / total
+    after = np.minimum(taken.sum(axis=1) + missed, 1.0)
+    safe = np.maximum(after, 1e-300)
+    return Association(after, taken / safe[:, None], missed / safe, 1 / (1 + mu.sum(axis=0)))
+
+
+def update(
+    means: Floats, covariances: Floats, prediction: Prediction, weights: Floats, missed: Floats
+) -> tuple[Floats, Floats]:
+    """The moment-matched PDA update of means (n, T) and covariances (n, n, T) by weights (T, M), missed (T,)."""
+    nu = np.einsum("atm,tm->at", prediction.innovations, weights)
+    second = np.einsum("atm,btm,tm->abt", prediction.innovations, prediction.innovations, weights, optimize=True)
+    spread = second - linalg.outer(nu, nu) - (1 - missed) * prediction.covariance
+    K = prediction.gain
+    return means + linalg.matvec(K, nu), linalg.symmetrise(covariances + linalg.congruence(K, spread))

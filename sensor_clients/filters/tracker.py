@@ -1,0 +1,164 @@
+"""A local multi-target tracker: Bernoulli tracks with nearly constant velocity, JIPDA, adaptive starts.
+
+One scan at a time: predict, associate all returns with all tracks at once (`association`), update, start a
+track from what the tracks leave unexplained, drop what is improbable. It is IPDA (Musicki, Evans and
+Stankovic 1994) with joint association, and the marginal Poisson multi-Bernoulli filter (Williams 2015)
+with births where returns fall: a return that no track claims starts one with existence
+unused * birth / (birth + clutter), both intensities per unit of measurement space and scan.
+
+A track is reported once its existence has passed `confirm`, until it falls below `drop`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg, motion
+from schemas import Motion
+from sensor_clients.filters.association import associate, likelihood, update
+from sensor_clients.filters.measurement import STATE, Floats, MeasurementModel, predict_measurement
+
+__all__ = ["LocalTracker", "Report", "TrackerConfig"]
+
+
+@dataclass(frozen=True, slots=True)
+class TrackerConfig:
+    """motion of the targets; survival: probability that a target lives on for one second; sigma_speed:
+    standard deviation per axis of a new track's velocity, m/s; gate: squared Mahalanobis distance;
+    confirm, drop: existence at which a track is first reported and at which it ends, for a tentative track
+    `drop_tentative`; max_sigma: a track whose position is less certain than this (m, along the worst of
+    its axes) ends; merge: squared distance of two tracks, under the sum of their covariances, below which
+    the younger ends; cubature: CKF, else EKF."""
+
+    motion: Motion
+    survival: float
+    sigma_speed: float
+    gate: float = 16.0
+    confirm: float = 0.95
+    drop: float = 0.3
+    drop_tentative: float = 0.01
+    max_sigma: float = math.inf
+    merge: float = 0.0
+    cubature: bool = True
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Report:
+    """Confirmed tracks at one time: ids (T,) u64, means (T, 4), covariances (T, 4, 4), existence (T,),
+    updated (T,) i64 time of the last scan in which the track probably was seen, ns."""
+
+    time: int
+    ids: NDArray[np.uint64]
+    means: Floats
+    covariances: Floats
+    existence: Floats
+    updated: NDArray[np.int64]
+
+
+class LocalTracker:
+    """Tracks of one sensor. Not for several threads.
+
+    ids: (T,) i64, never used twice; means (4, T), covariances (4, 4, T), existence (T,).
+    """
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self.config = config
+        self.time: int | None = None
+        self.means: Floats = np.zeros((4, 0))
+        self.covariances: Floats = np.zeros((4, 4, 0))
+        self.existence: Floats = np.zeros(0)
+        self.ids: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self.updated: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self.confirmed: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self._next = 1
+
+    def predict(self, time: int) -> None:
+        """Move all tracks on to `time`, ns. ValueError if that is back in time."""
+        dt = 0.0 if self.time is None else (time - self.time) * 1e-9
+        self.means, self.covariances = motion.predict(
+            self.config.motion, STATE, self.means, self.covariances, np.full(len(self.ids), dt)
+        )
+        self.existence = self.existence * self.config.survival**dt
+        self.time = time
+
+    def step(
+        self,
+        time: int,
+        returns: Floats,
+        model: MeasurementModel,
+        clutter: Floats,
+        birth: Floats,
+        detection: Callable[[Floats], Floats],
+    ) -> None:
+        """One scan at `time`, ns: returns (2, M), with the intensities of clutter and of first returns of new
+        targets at each (M,), per unit of measurement space; `detection` gives the probability (T,) that a
+        target at a place (2, T) is seen: 0 outside the field of view, where tracks end."""
+        config = self.config
+        self.predict(time)
+        p = detection(self.means[:2])
+        self._keep(p > 0)
+        p = p[p > 0] * (1 - math.exp(-config.gate / 2))
+        prediction = predict_measurement(model, self.means, self.covariances, returns, config.cubature)
+        found = associate(likelihood(prediction, config.gate), self.existence, p, clutter + birth)
+        self.means, self.covariances = update(self.means, self.covariances, prediction, found.weights, found.missed)
+        self.existence = found.existence
+        self.updated = np.where(found.missed < 0.5, time, self.updated)
+        self._prune()
+        self._start(returns, model, found.unused * birth / (clutter + birth))
+        self.confirmed = self.confirmed | (self.existence >= config.confirm)
+
+    def report(self, select: NDArray[np.bool_] | None = None) -> Report:
+        """The confirmed tracks, or those of them that `select` (T,) names, at the time of the last step."""
+        chosen = self.confirmed if select is None else self.confirmed & select
+        return Report(
+            self.time or 0,
+            self.ids[chosen].astype(np.uint64),
+            np.ascontiguousarray(self.means[:, chosen].T),
+            np.ascontiguousarray(self.covariances[..., chosen].transpose(2, 0, 1)),
+            self.existence[chosen],
+            self.updated[chosen],
+        )
+
+    def _start(self, returns: Floats, model: MeasurementModel, existence: Floats) -> None:
+        chosen = existence >= self.config.drop_tentative
+        count = int(chosen.sum())
+        place, spread = model.locate(np.ascontiguousarray(returns[:, chosen]))
+        covariances = np.zeros((4, 4, count))
+        covariances[:2, :2] = spread
+        covariances[2, 2] = covariances[3, 3] = self.config.sigma_speed**2
+        self.means = np.concatenate([self.means, np.concatenate([place, np.zeros((2, count))])], axis=1)
+        self.covariances = np.concatenate([self.covariances, covariances], axis=2)
+        self.existence = np.concatenate([self.existence, existence[chosen]])
+        self.ids = np.concatenate([self.ids, np.arange(self._next, self._next + count)])
+        self.updated = np.concatenate([self.updated, np.full(count, self.time, dtype=np.int64)])
+        self.confirmed = np.concatenate([self.confirmed, np.zeros(count, dtype=np.bool_)])
+        self._next += count
+
+    def _prune(self) -> None:
+        config = self.config
+        P = self.covariances
+        half = (P[0, 0] + P[1, 1]) / 2
+        worst = half + np.hypot((P[0, 0] - P[1, 1]) / 2, P[0, 1])
+        floor = np.where(self.confirmed, config.drop, config.drop_tentative)
+        self._keep((self.existence >= floor) & (worst <= config.max_sigma**2))
+        if config.merge and len(self.ids) > 1:
+            i, j = np.triu_indices(len(self.ids), 1)
+            apart = linalg.quadratic(
+                self.covariances[..., i] + self.covariances[..., j], self.means[:, i] - self.means[:, j]
+            )
+            keep = np.ones(len(self.ids), dtype=np.bool_)
+            # Tracks stand in the order of their age.
+            for first, second in zip(i[apart < config.merge], j[apart < config.merge], strict=True):
+                keep[second] &= not keep[first]
+            self._keep(keep)
+
+    def _keep(self, chosen: NDArray[np.bool_]) -> None:
+        if not chosen.all():
+            self.means, self.covariances = self.means[:, chosen], self.covariances[..., chosen]
+            self.existence, self.ids = self.existence[chosen], self.ids[chosen]
+            self.updated, self.confirmed = self.updated[chosen], self.confirmed[chosen]

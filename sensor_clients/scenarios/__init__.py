@@ -1,0 +1,1 @@
+"""Simulated worlds: truth, sensors, clutter, and the local tracker of each sensor."""
