@@ -1,0 +1,172 @@
+"""`fusion-service`: hub, run, record, demo, check, rules. Exit codes: 0 done, 1 failure, 2 bad usage or config."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+from fusion_service.process import set_up_logging, stop_on_signals
+
+__all__ = ["main"]
+
+ENDPOINT = "tcp/127.0.0.1:7447"
+
+
+class _Help(argparse.RawDescriptionHelpFormatter):
+    """Keeps the examples as they are written."""
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="fusion-service",
+        description="Associates and fuses the tracks of remote sensors into one picture.",
+        epilog="Example: fusion-service demo\n`fusion-service COMMAND --help` shows an example for each command.",
+        formatter_class=_Help,
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
+
+    def command(name: str, text: str, example: str) -> argparse.ArgumentParser:
+        sub = commands.add_parser(
+            name, help=text, description=text, epilog=f"Example:\n  {example}", formatter_class=_Help
+        )
+        sub.add_argument("-v", "--verbose", action="store_true", help="log more")
+        return sub
+
+    hub = command(
+        "hub", "The bus: a Zenoh router that everything else joins.", f"fusion-service hub --listen {ENDPOINT}"
+    )
+    hub.add_argument("--listen", action="append", metavar="ENDPOINT", help=f"where to listen (default {ENDPOINT})")
+
+    run = command("run", "The fusion service.", "fusion-service run --config centre.toml")
+    run.add_argument("--config", metavar="FILE", help="TOML file (default: all defaults; `check` shows them)")
+    run.add_argument("--connect", action="append", metavar="ENDPOINT", help="hub to join, instead of the config's")
+    run.add_argument("--hub", action="store_true", help="hold a hub in this process too (the smallest installation)")
+
+    record = command("record", "Record everything on the bus.", "fusion-service record --out mission.rrd")
+    record.add_argument("--out", metavar="FILE", help="recording (default runs/mission-<UTC time>.rrd)")
+    record.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"hub to join (default {ENDPOINT})")
+    record.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
+
+    demo = command(
+        "demo",
+        "A whole mission: hub, service, clients and recorder as processes, then a table, a map and a recording.",
+        "fusion-service demo\n"
+        "  fusion-service demo --rule hmd-ga --json result.json\n"
+        "  fusion-service demo --scenario autoferry:2 --data DIR --speed 10",
+    )
+    demo.add_argument("--scenario", default="three-radars", help="three-radars (default), or autoferry:N")
+    demo.add_argument("--data", metavar="DIR", help="folder of the Autoferry files (default: $FUSION_DATA)")
+    demo.add_argument("--rule", default="ci", help="fusion rule (default ci; `fusion-service rules` lists them)")
+    demo.add_argument("--criterion", help="of the rule's weights: det or trace")
+    demo.add_argument("--memory", default="restart", choices=("restart", "recursive"), help="default restart")
+    demo.add_argument("--speed", type=float, default=None, help="times faster than real time (default 10)")
+    demo.add_argument("--seed", type=int, default=1, help="of the simulated sensors (default 1)")
+    demo.add_argument("--out", metavar="DIR", help="folder of the results (default runs/<scenario>-<rule>-<UTC time>)")
+    demo.add_argument("--json", metavar="FILE", help="write the scores here")
+
+    check = command(
+        "check", "Check a config; without a file, print one with every default.", "fusion-service check centre.toml"
+    )
+    check.add_argument("config", nargs="?", metavar="FILE", help="TOML file")
+
+    command("rules", "The fusion rules and what each promises.", "fusion-service rules")
+    return parser
+
+
+def _hub(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.hub import run_hub
+
+    run_hub(args.listen or [ENDPOINT], stop)
+
+
+def _run(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.bus import open_bus
+    from fusion_service.config import ServiceConfig, load_config
+    from fusion_service.daemon import run_service
+
+    config = load_config(args.config) if args.config else ServiceConfig()
+    if args.connect:
+        config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, connect=tuple(args.connect)))
+    if args.hub:
+        with open_bus(listen=config.bus.connect, mode="router"):
+            run_service(config, stop)
+    else:
+        run_service(config, stop)
+
+
+def _record(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.bus import open_bus
+    from fusion_service.recording import default_path, run_recorder
+
+    path = Path(args.out) if args.out else default_path()
+    with open_bus(args.connect or [ENDPOINT], stop=stop) as bus:
+        run_recorder(bus, path, realm=args.realm, stop=stop)
+
+
+def _demo(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.demo import run_demo
+
+    run_demo(
+        scenario=args.scenario,
+        rule=args.rule,
+        criterion=args.criterion,
+        memory=args.memory,
+        data=args.data,
+        speed=args.speed,
+        seed=args.seed,
+        out=Path(args.out) if args.out else None,
+        json_path=Path(args.json) if args.json else None,
+        stop=stop,
+    )
+
+
+def _check(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.config import config_hash, example_toml, load_config
+
+    if args.config is None:
+        sys.stdout.write(example_toml())
+        return
+    config = load_config(args.config)
+    print(
+        f"{args.config}: good ({config.centre.rule}, {config.centre.memory} memory, hash {config_hash(config.centre)})"
+    )
+
+
+def _rules(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.rules import RULES
+
+    for rule in RULES.values():
+        options = ", ".join(f"{name}={value!r}" for name, value in rule.options.items()) or "none"
+        print(f"{rule.name:<18}{'N-way   ' if rule.n_way else 'pairwise'}  {rule.promise}")
+        print(f"{'':<18}options: {options}; source: {rule.source}")
+
+
+COMMANDS = {"hub": _hub, "run": _run, "record": _record, "demo": _demo, "check": _check, "rules": _rules}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command; returns the exit code."""
+    args = _parser().parse_args(argv)
+    set_up_logging(args.verbose)
+    from fusion_service.bus import BusError, BusStopped
+    from fusion_service.config import ConfigError
+    from fusion_service.demo import DemoError
+    from fusion_service.recording import RecordingError
+    from fusion_service.state import StateError
+
+    with stop_on_signals() as stop:
+        try:
+            COMMANDS[args.command](args, stop)
+        except BusStopped:
+            return 0
+        except ConfigError as error:
+            print("\n".join(error.problems), file=sys.stderr)
+            return 2
+        except (BusError, DemoError, RecordingError, StateError, OSError) as error:
+            print(f"fusion-service {args.command}: {error}", file=sys.stderr)
+            return 1
+    return 0

@@ -1,0 +1,182 @@
+"""One source as the centre knows it: its run, its sequence, what it says of itself, its newest tracks.
+
+Tracks are kept column by column, sorted by local id, batch axis last, in the centre's frame and the source's
+own state space. `link` is the global id a track is linked to (0: none); it lives as long as the local id does
+within one epoch, so a restarted client takes over nobody's links.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import geodesy, linalg
+from schemas import Frame, Height, LocalTracks, SensorInfo
+
+__all__ = ["REMEMBERED", "Source", "Tracks", "empty_tracks", "message_tracks", "newest"]
+
+REMEMBERED = 1024
+"""Messages of one source whose exact repeat is recognised; older ones are too late to matter."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """T tracks of one source: mean (n, T), covariance (n, n, T), the rest (T,).
+
+    id u64; time i64 of the density; updated i64 of the last measurement; existence (NaN: not reported);
+    link u64 global id or 0; since i64 step of the link; fails i64 steps in a row that the link has failed;
+    used i64 time of the version last fused (-1: none).
+    """
+
+    id: NDArray[np.uint64]
+    time: NDArray[np.int64]
+    mean: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    existence: NDArray[np.float64]
+    updated: NDArray[np.int64]
+    link: NDArray[np.uint64]
+    since: NDArray[np.int64]
+    fails: NDArray[np.int64]
+    used: NDArray[np.int64]
+
+    def take(self, rows: Any) -> Tracks:
+        """The given rows (indices or a mask)."""
+        return Tracks(*(getattr(self, one.name)[..., rows] for one in fields(self)))
+
+
+LINKS = ("link", "since", "fails", "used")
+
+
+def empty_tracks(n: int) -> Tracks:
+    """No tracks, of n components."""
+    whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
+    ids = np.zeros(0, dtype=np.uint64)
+    return Tracks(ids, whole, np.zeros((n, 0)), np.zeros((n, n, 0)), real, whole, ids, whole, whole, whole)
+
+
+def message_tracks(message: LocalTracks, sound: NDArray[np.bool_], frame: Frame, height: Height | None) -> Tracks:
+    """The sound tracks of a message in `frame`, mixtures as their mean and covariance, sorted by id.
+
+    Raises `geodesy.FrameError` where the message's frame cannot be brought into `frame`.
+    """
+    means, covariances = message.means, message.covariances
+    if message.counts is not None and message.weights is not None:
+        means, covariances = _moments(message.weights, means, covariances, message.counts.astype(np.intp))
+    rows = np.flatnonzero(sound)
+    rows = rows[np.argsort(message.ids[rows], kind="stable")]
+    means, covariances = geodesy.transform(
+        means[rows], covariances[rows], message.space, message.frame, frame, message.height or height
+    )
+    times = np.full(len(rows), message.time, dtype=np.int64)
+    none = np.full(len(rows), -1, dtype=np.int64)
+    return Tracks(
+        id=message.ids[rows].astype(np.uint64),
+        time=times,
+        mean=linalg.to_last(means, 1),
+        covariance=linalg.symmetrise(linalg.to_last(covariances, 2)),
+        existence=np.full(len(rows), np.nan) if message.existence is None else message.existence[rows].astype(float),
+        updated=times if message.updated is None else np.minimum(message.updated[rows], times),
+        link=np.zeros(len(rows), dtype=np.uint64),
+        since=none,
+        fails=np.zeros(len(rows), dtype=np.int64),
+        used=none,
+    )
+
+
+def _moments(
+    weights: NDArray[np.float64],
+    means: NDArray[np.float64],
+    covariances: NDArray[np.float64],
+    counts: NDArray[np.intp],
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    if not len(counts):
+        return means, covariances
+    starts = np.cumsum(counts) - counts
+    weights = weights / np.repeat(np.add.reduceat(weights, starts), counts)
+    mean = np.add.reduceat(weights[:, None] * means, starts)
+    offset = means - np.repeat(mean, counts, axis=0)
+    spread = covariances + offset[:, :, None] * offset[:, None, :]
+    return mean, np.add.reduceat(weights[:, None, None] * spread, starts)
+
+
+def newest(old: Tracks, new: Tracks) -> Tracks:
+    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept."""
+    if len(old.id) and len(new.id):
+        at = np.minimum(np.searchsorted(old.id, new.id), len(old.id) - 1)
+        known = old.id[at] == new.id
+        kept = {name: np.where(known, getattr(old, name)[at], getattr(new, name)) for name in LINKS}
+        new = replace(new, **kept)
+    both = Tracks(*(np.concatenate([getattr(old, one.name), getattr(new, one.name)], axis=-1) for one in fields(old)))
+    order = np.lexsort((np.arange(len(both.id)), both.time, both.id))
+    last = np.append(both.id[order][1:] != both.id[order][:-1], True) if len(order) else np.zeros(0, dtype=np.bool_)
+    return both.take(order[last])
+
+
+@dataclass(slots=True)
+class Source:
+    """State of one source. Times are ns; -1 means never."""
+
+    name: str
+    space: tuple[str, ...]
+    tracks: Tracks
+    epoch: int = -1
+    info: SensorInfo | None = None
+    alive: bool | None = None
+    muted: bool = False
+    origin: str = "live"
+    waited: int = 0
+    last: int = -1
+    complete: int = -1
+    offset: int = 0
+    messages: int = 0
+    repeats: int = 0
+    gaps: int = 0
+    reordered: int = 0
+    highest: dict[str, int] = field(default_factory=dict)
+    seen: deque[tuple[str, int, int]] = field(default_factory=deque)
+    seen_set: set[tuple[str, int, int]] = field(default_factory=set)
+
+    def begin(self, epoch: int) -> None:
+        """Forget the last run: tracks, links, sequence."""
+        self.epoch, self.info, self.waited, self.last, self.complete = epoch, None, 0, -1, -1
+        self.tracks = empty_tracks(len(self.space))
+        self.highest, self.seen, self.seen_set = {}, deque(), set()
+
+    def is_repeat(self, kind: str, seq: int, digest: int) -> bool:
+        """Whether this very message was taken before."""
+        return (kind, seq, digest) in self.seen_set
+
+    def note(self, kind: str, seq: int, digest: int) -> None:
+        """Count a message into the sequence: a gap is what is missing so far, a late filler mends it."""
+        self.messages += 1
+        highest = self.highest.get(kind)
+        if highest is None or seq > highest:
+            if highest is not None:
+                self.gaps += seq - highest - 1
+            self.highest[kind] = seq
+        elif seq < highest:
+            self.reordered += 1
+            self.gaps = max(0, self.gaps - 1)
+        key = (kind, seq, digest)
+        self.seen.append(key)
+        self.seen_set.add(key)
+        if len(self.seen) > REMEMBERED:
+            self.seen_set.discard(self.seen.popleft())
+
+    def apply(self, message: LocalTracks, new: Tracks) -> None:
+        """Take the tracks of a message; those of a complete scan that it does not list are gone."""
+        self.last = max(self.last, message.time)
+        if message.time < self.complete:
+            return
+        if new.mean.shape[0] != self.tracks.mean.shape[0] or message.space != self.space:
+            self.space, self.tracks = message.space, empty_tracks(len(message.space))
+        merged = newest(self.tracks, new)
+        if message.complete:
+            self.complete = message.time
+            listed = np.isin(merged.id, message.ids)
+            merged = merged.take(listed | (merged.time > message.time))
+        self.tracks = merged

@@ -1,0 +1,108 @@
+"""What survives the process: id generations and the checkpoint, in one folder that one service holds.
+
+A global id is (generation, counter), 32 bits each. Every start takes a new generation and writes it to disk
+before any id of it is used: that reserves the block of 2^32 counters under it, and no id is ever given
+twice, whatever is killed when. A generation is also never below the seconds since 2020, so that a lost folder
+does no harm while the clock is right.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+__all__ = ["State", "StateError", "open_state"]
+
+YEAR_2020 = 1_577_836_800
+SYNC_PERIOD = 5.0
+
+
+class StateError(Exception):
+    """The folder cannot be used, and why, in one line."""
+
+
+def _by_clock() -> int:
+    return max(1, int(time.time()) - YEAR_2020)
+
+
+class State:
+    """Ids and checkpoint in `folder`; None keeps nothing and numbers generations by the clock."""
+
+    def __init__(self, folder: Path | None) -> None:
+        self._folder = folder
+        self._synced = 0.0
+        self._last = 0
+
+    def take_generation(self) -> int:
+        """A generation that was never taken before, on disk when this returns."""
+        last = self._last
+        if self._folder is not None:
+            path = self._folder / "generation"
+            try:
+                last = int(path.read_text()) if path.exists() else 0
+            except ValueError:
+                raise StateError(f"{path} does not hold a number: delete it to go on with the clock's") from None
+        self._last = max(last + 1, _by_clock())
+        if self._folder is not None:
+            self._write("generation", f"{self._last}\n".encode(), sync=True)
+        return self._last
+
+    def load(self) -> bytes | None:
+        """The last checkpoint, if there is one."""
+        if self._folder is None or not (self._folder / "checkpoint").exists():
+            return None
+        return (self._folder / "checkpoint").read_bytes()
+
+    def set_aside(self) -> None:
+        """Keep a checkpoint that cannot be used, under another name."""
+        if self._folder is not None:
+            with contextlib.suppress(FileNotFoundError):
+                os.replace(self._folder / "checkpoint", self._folder / "checkpoint.refused")
+
+    def save(self, blob: bytes) -> None:
+        """Replace the checkpoint at once: whole or not at all after kill -9; synced to disk every few seconds."""
+        if self._folder is not None:
+            now = time.monotonic()
+            sync = now - self._synced > SYNC_PERIOD
+            self._synced = now if sync else self._synced
+            self._write("checkpoint", blob, sync=sync)
+
+    def _write(self, name: str, data: bytes, *, sync: bool) -> None:
+        assert self._folder is not None
+        part = self._folder / f"{name}.part"
+        with open(part, "wb") as file:
+            file.write(data)
+            if sync:
+                file.flush()
+                os.fsync(file.fileno())
+        os.replace(part, self._folder / name)
+        if sync:
+            handle = os.open(self._folder, os.O_RDONLY)
+            try:
+                os.fsync(handle)
+            finally:
+                os.close(handle)
+
+
+@contextlib.contextmanager
+def open_state(folder: str | None) -> Iterator[State]:
+    """The state in `folder` (made if need be), held against a second service. `StateError` if it cannot be."""
+    if folder is None:
+        yield State(None)
+        return
+    path = Path(folder)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        lock = open(path / "lock", "w")  # noqa: SIM115 (held until the end)
+    except OSError as error:
+        raise StateError(f"the state folder {path} cannot be used: {error.strerror}") from None
+    with lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            raise StateError(f"another service uses the state folder {path}: stop it or set service.state") from None
+        yield State(path)
