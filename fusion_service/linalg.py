@@ -28,18 +28,22 @@ __all__ = [
     "blocks",
     "congruence",
     "det",
+    "inner",
     "inverse",
     "is_positive_definite",
     "ldl",
     "logdet",
     "matvec",
     "outer",
+    "product",
     "quadratic",
     "solve",
     "sweep",
     "symmetrise",
     "to_first",
     "to_last",
+    "total",
+    "trace",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -245,6 +249,44 @@ def matvec(A: FloatArray, x: FloatArray) -> FloatArray:
 def outer(x: FloatArray, y: FloatArray) -> FloatArray:
     """x y', (m, n, B), for x (m, B) and y (n, B)."""
     out: FloatArray = x[:, None] * y[None, :]
+    return out
+
+
+def product(A: FloatArray, B: FloatArray) -> FloatArray:
+    """A B, (m, n, B), for A (m, k, B) and B (k, n, B)."""
+    with np.errstate(all="ignore"):
+        out: FloatArray = A[:, 0, None] * B[None, 0]
+        for k in range(1, A.shape[1]):
+            out += A[:, k, None] * B[None, k]
+    return out
+
+
+def inner(A: FloatArray, B: FloatArray) -> FloatArray:
+    """tr(A B), (B,), for symmetric A and B."""
+    with np.errstate(all="ignore"):
+        out: FloatArray = A[0, 0] * B[0, 0]
+        for i in range(1, len(A)):
+            twice = A[i, 0] * B[i, 0]
+            for j in range(1, i):
+                twice += A[i, j] * B[i, j]
+            out += twice + twice
+            out += A[i, i] * B[i, i]
+    return out
+
+
+def trace(A: FloatArray) -> FloatArray:
+    """tr A, (B,)."""
+    out: FloatArray = A[0, 0].copy()
+    for i in range(1, len(A)):
+        out += A[i, i]
+    return out
+
+
+def total(a: FloatArray) -> FloatArray:
+    """Sum over the first axis in its order; `np.sum` chooses the order by the shape of the batch."""
+    out: FloatArray = np.array(a[0])
+    for row in a[1:]:
+        out += row
     return out
 
 

@@ -1,0 +1,12 @@
+"""Fusion rules: several Gaussian estimates of one state, whose errors may be correlated, become one.
+
+`fuse` checks its input and takes any batch shape; `fuse_last` trusts it, batch-last. `RULES` tells what
+each rule is and what it promises.
+
+    fused = fuse("ci", means, covariances, criterion="det")
+    fused.mean, fused.covariance, fused.weights
+"""
+
+from .face import RULES, Fused, Rule, RuleError, fuse, fuse_last
+
+__all__ = ["RULES", "Fused", "Rule", "RuleError", "fuse", "fuse_last"]

@@ -1,0 +1,142 @@
+"""Covariance intersection (CI) and its version for bounded correlation (BCI).
+
+Both fuse the sources as independent, with covariances inflated until the block-diagonal joint covariance
+bounds every admissible one:
+
+    P^-1 = sum c_i P_i^-1,    P^-1 x = sum c_i P_i^-1 x_i
+
+CI (Julier and Uhlmann; Li-AA sec. II; geometric mean of the densities): c_i = w_i. Conservative whatever
+the correlation.
+
+BCI: if ||P_i^-1/2 P_ij P_j^-T/2|| <= R_ij for each pair of errors, c_i = w_i / (R w)_i is conservative for
+every such joint covariance, since x' J x <= sum R_ij |x_i||x_j| <= sum_i ((R w)_i / w_i) |x_i|^2 in
+whitened coordinates. With one number rho for all pairs, c(w) = w / ((1-rho) w + rho), concave, so the best
+weights are unique in effect; rho = 1 is CI, rho = 0 the naive rule. A matrix R of different bounds, for
+N > 2, makes the search for weights non-convex: a local optimum from equal weights is used, which is as
+conservative as any.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import linalg
+from ..linalg import FloatArray, inner
+from . import pairs, simplex
+from .sources import Result, Sources, weighted_product
+
+
+def ci(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:
+    """Covariance intersection."""
+    return _intersection(sources, weights, influence, criterion, 1.0)
+
+
+def bci(
+    sources: Sources,
+    weights: FloatArray | None,
+    influence: bool,
+    *,
+    criterion: str,
+    max_correlation: float | FloatArray,
+) -> Result:
+    """Bounded covariance inflation; `max_correlation` a number or (N, N)."""
+    R = np.asarray(max_correlation, dtype=np.float64)
+    if R.ndim == 2:
+        others = R[~np.eye(len(R), dtype=np.bool_)]
+        if others.size and (others != others[0]).any():
+            return _bounded_by_pair(sources, weights, influence, criterion, R)
+        R = others[:1] if others.size else np.ones(1)
+    return _intersection(sources, weights, influence, criterion, float(R.item()))
+
+
+def _intersection(sources: Sources, weights: FloatArray | None, influence: bool, criterion: str, rho: float) -> Result:
+    model = Inflated(sources.information, rho)
+    optimise = weights is None and rho > 0.0 and sources.count > 1
+    w = sources.uniform if weights is None else weights
+    if optimise and sources.count == 2 and sources.fast and len(sources.means) <= pairs.LIMIT:
+        t = pairs.best_weight(criterion, model.A[:, :, 1], model.A[:, :, 0], rho=rho)
+        w = np.stack([t, 1.0 - t])
+    elif optimise:
+        w = simplex.best_weights(criterion, model, w)
+    scale, slope, _ = model.scale(w)
+    mean, P, condition = weighted_product(sources, scale)
+    gap, share = np.zeros_like(condition), None
+    if optimise:
+        g = simplex.gradient(criterion, P, model.A)
+        gap = simplex.gap(w, g * slope)
+    if influence:
+        share = (-g if optimise and criterion == "det" else inner(P[:, :, None], model.A)) * scale / len(P)
+    return Result(mean, P, w, share, condition, gap)
+
+
+def _bounded_by_pair(
+    sources: Sources, weights: FloatArray | None, influence: bool, criterion: str, R: FloatArray
+) -> Result:
+    model = Coupled(sources.information, R)
+    w = simplex.best_weights(criterion, model, sources.uniform) if weights is None else weights
+    scale = w / model.crowd(w)
+    mean, P, condition = weighted_product(sources, scale)
+    share = inner(P[:, :, None], model.A) * scale / len(P) if influence else None
+    return Result(mean, P, w, share, condition, np.zeros_like(condition))
+
+
+@dataclass(frozen=True, slots=True)
+class Inflated:
+    """M(w) = sum c(w_i) A_i, c(w) = w / ((1-rho) w + rho)."""
+
+    A: FloatArray  # (n, n, N, B)
+    rho: float
+
+    def scale(self, w: FloatArray) -> tuple[FloatArray, FloatArray | float, FloatArray | float]:
+        """c, c' and c''."""
+        if self.rho == 1.0:
+            return w, 1.0, 0.0
+        if self.rho == 0.0:
+            return np.ones_like(w), 0.0, 0.0
+        d = (1.0 - self.rho) * w + self.rho
+        slope = self.rho / (d * d)
+        return w / d, slope, -2.0 * (1.0 - self.rho) * slope / d
+
+    def __call__(self, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+        c, slope, _ = self.scale(w)
+        return _sum(self.A * c), self.A * slope
+
+    def bend(self, w: FloatArray, G: FloatArray) -> FloatArray | None:
+        if self.rho == 1.0:
+            return None
+        return simplex.diagonal(-self.scale(w)[2] * inner(G[:, :, None], self.A))
+
+    def take(self, index: NDArray[np.bool_]) -> Self:
+        return replace(self, A=self.A[..., index])
+
+
+@dataclass(frozen=True, slots=True)
+class Coupled:
+    """M(w) = sum w_i / (R w)_i A_i. Its second derivatives may have either sign, and are left out."""
+
+    A: FloatArray  # (n, n, N, B)
+    R: FloatArray  # (N, N)
+
+    def crowd(self, w: FloatArray) -> FloatArray:
+        """R w."""
+        return linalg.matvec(self.R, w)
+
+    def __call__(self, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+        crowd = self.crowd(w)
+        own = self.A / crowd
+        pull = own * (w / crowd)
+        others = np.stack([_sum(pull * self.R[:, j, None]) for j in range(len(w))], axis=2)
+        return _sum(own * w), own - others
+
+    def bend(self, w: FloatArray, G: FloatArray) -> None:
+        return None
+
+    def take(self, index: NDArray[np.bool_]) -> Self:
+        return replace(self, A=self.A[..., index])
+
+
+def _sum(A: FloatArray) -> FloatArray:
+    """Over the sources: (n, n, N, B) -> (n, n, B)."""
+    return linalg.total(A.transpose(2, 0, 1, 3))

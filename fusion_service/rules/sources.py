@@ -1,0 +1,92 @@
+"""What every rule works on and gives back: one block of fusions, batch-last, factorised once."""
+
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import linalg
+from ..linalg import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Sources:
+    """N Gaussians per fusion. float64 on the fast road, longdouble on the safe one."""
+
+    means: FloatArray  # (n, N, B)
+    covariances: FloatArray  # (n, n, N, B)
+    information: FloatArray  # (n, n, N, B), the inverses
+    dets: FloatArray  # (N, B), of the covariances
+    condition: FloatArray  # (B,), see `condition`
+    definite: NDArray[np.bool_]  # (B,), every covariance is positive definite
+
+    @classmethod
+    def of(cls, means: FloatArray, covariances: FloatArray) -> Self:
+        """From the layout of `fuse_last`: means (N, n, B), covariances (N, n, n, B)."""
+        P = covariances.transpose(1, 2, 0, 3)
+        A, dets, margin = linalg.sweep(P)
+        worst = condition(P, A).max(axis=0)
+        return cls(means.transpose(1, 0, 2), P, A, dets, worst, np.all(margin > 1e-14, axis=0, keepdims=True)[0])
+
+    @property
+    def count(self) -> int:
+        return int(self.means.shape[1])
+
+    @property
+    def fast(self) -> bool:
+        return self.covariances.dtype == np.float64
+
+    @property
+    def uniform(self) -> FloatArray:
+        """Equal weights (N, B)."""
+        return np.full_like(self.means[0], 1.0 / self.count)
+
+    @property
+    def spread(self) -> FloatArray:
+        """The means relative to the first source's, so that their size costs no digits."""
+        return self.means - self.means[:, :1]
+
+
+@dataclass(frozen=True, slots=True)
+class Result:
+    """One block, fused."""
+
+    mean: FloatArray  # (n, B)
+    covariance: FloatArray  # (n, n, B)
+    weights: FloatArray  # (N, B)
+    influence: FloatArray | None  # (N, B)
+    condition: FloatArray  # (B,): rounding errors of the inputs, as they reach the result
+    gap: FloatArray  # (B,): of the weights, 0 where they are not optimised
+
+
+def condition(P: FloatArray, A: FloatArray) -> FloatArray:
+    """max_k P_kk A_kk for A = P^-1: the largest variance inflation factor.
+
+    Whatever the units of the components, the condition number of the correlation matrix lies between this
+    and n^2 times this, and an inverse computed by elimination is the exact inverse of some P + dP with
+    A + dA within a factor 1 +- n^2 eps condition of A, as quadratic forms. Such factors pass through
+    sums, so the condition of the matrices inverted on the way tells how good a fused result is.
+    """
+    out: FloatArray = P[0, 0] * A[0, 0]
+    for k in range(1, len(P)):
+        np.maximum(out, P[k, k] * A[k, k], out=out)
+    return out
+
+
+def weighted_product(sources: Sources, scale: FloatArray | None) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Mean, covariance and condition of the product of N(x_i, P_i / scale_i): P^-1 = sum scale_i P_i^-1.
+
+    `scale` (N, B), or None for ones.
+    """
+    A, x = sources.information, sources.spread
+    if scale is not None:
+        A = A * scale
+    M = A[:, :, 0].copy()
+    y = np.zeros_like(x[:, 0])
+    for i in range(1, sources.count):
+        M += A[:, :, i]
+        y += linalg.matvec(A[:, :, i], x[:, i])
+    P = linalg.inverse(M)
+    mean = sources.means[:, 0] + linalg.matvec(P, y)
+    return mean, P, np.maximum(sources.condition, condition(M, P))
