@@ -52,8 +52,16 @@ def _unique(ids: U64) -> None:
         raise MessageError("bad-field", "ids: one stands twice")
 
 
+def _placed(values: Values) -> int:
+    """n, where the state space has a place in the frame."""
+    space = values["space"]
+    if type(values["frame"]) is Ecef and "z" not in space:
+        raise MessageError("bad-field", "space: states in an ecef frame need z")
+    return len(space)
+
+
 def _densities(values: Values, components: int) -> None:
-    n = len(values["space"])
+    n = _placed(values)
     triangle = n * (n + 1) // 2
     means, packed = values["means"], values["covariances"]
     if len(means) != components * n or len(packed) != components * triangle:
@@ -130,7 +138,7 @@ def _log(values: Values) -> None:
 
 
 def _truth(values: Values) -> None:
-    ids, n = values["ids"], len(values["space"])
+    ids, n = values["ids"], _placed(values)
     _unique(ids)
     _lengths(values, len(ids) * n, "means")
     values["means"] = values["means"].reshape(len(ids), n)
