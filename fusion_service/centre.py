@@ -26,7 +26,7 @@ from fusion_service.intake import Event, Intake, Order, Refused, SourceFound, So
 from fusion_service.journal import Journal
 from fusion_service.lifecycle import advance, empty_picture, newborn
 from fusion_service.motion import predict
-from fusion_service.rules import fuse_last
+from fusion_service.rules import Fused, fuse_last
 from fusion_service.sources import Source, Tracks
 from schemas import ORIGINS, Entry, GlobalTracks, Local, Status, StepLog
 from schemas import messages as words
@@ -346,7 +346,7 @@ class FusionCentre:
             means = np.ascontiguousarray(np.moveaxis(tracks.mean[:, members], 2, 0))
             covariances = np.ascontiguousarray(np.moveaxis(tracks.covariance[:, :, members], 3, 0))
             fused = fuse_last(config.rule, means, covariances, influence=True, **config.rule_options)
-            one, spread, gains = fused.mean, fused.covariance, fused.influence
+            one, spread, gains = fused.mean, fused.covariance, _influence(fused)
             old = np.flatnonzero(picture.time[at] >= 0) if config.memory == "recursive" else at[:0]
             if len(old):
                 again = fuse_last(
@@ -357,7 +357,7 @@ class FusionCentre:
                     max_correlation=config.memory_correlation,
                 )
                 one[:, old], spread[:, :, old] = again.mean, again.covariance
-                gains[:, old] *= again.influence[0]
+                gains[:, old] *= _influence(again)[0]
             bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
             if bad.any():
                 one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
@@ -473,6 +473,11 @@ class FusionCentre:
             "reordered": source.reordered,
             "tracks": len(source.tracks.id),
         }
+
+
+def _influence(fused: Fused) -> NDArray[np.float64]:
+    assert fused.influence is not None
+    return fused.influence
 
 
 def _wide_bits(source: NDArray[np.intp]) -> NDArray[Any]:

@@ -155,7 +155,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     from fusion_service.bus import BusError, BusStopped
     from fusion_service.config import ConfigError
     from fusion_service.demo import DemoError
-    from fusion_service.recording import RecordingError
     from fusion_service.state import StateError
 
     with stop_on_signals() as stop:
@@ -166,7 +165,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         except ConfigError as error:
             print("\n".join(error.problems), file=sys.stderr)
             return 2
-        except (BusError, DemoError, RecordingError, StateError, OSError) as error:
+        except (BusError, DemoError, StateError, OSError) as error:
             print(f"fusion-service {args.command}: {error}", file=sys.stderr)
             return 1
     return 0

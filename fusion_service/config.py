@@ -176,7 +176,7 @@ class CentreConfig:
         1.0, _number(0, 1), "bound on the correlation of the last result and new tracks"
     )
     motion: Motion = _setting(Motion("cv", 1.0), lambda v: _build(Motion, v), "motion of a global track on its own")
-    gate: float = _setting(0.99, _number(0.5, 1 - 1e-9), "probability inside the gate for a new link")
+    gate: float = _setting(0.999, _number(0.5, 1 - 1e-9), "probability inside the gate for a new link")
     keep_gate: float = _setting(0.9999, _number(0.5, 1 - 1e-12), "probability inside the gate for a standing link")
     break_after: int = _setting(3, _whole(1, 255), "steps in a row that a link must fail before it is broken")
     merge_after: int = _setting(3, _whole(1, 255), "steps in a row that two global tracks must agree to be merged")
