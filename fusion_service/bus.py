@@ -41,6 +41,8 @@ __all__ = [
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 HEARTBEAT = 0.5
 """Seconds after which a lost last sample is noticed."""
+HANDSHAKE = 3.0
+"""Seconds that a hub has for the opening of a session; as long may a process that gave up waiting take to end."""
 RETRY = 0.2
 REMIND = 30.0
 MAX_PUBLISHERS = 4096
@@ -159,7 +161,7 @@ class Bus:
     ) -> Declaration:
         """Call `callback(key, data)` for every sample, in order per publisher, gaps filled where the publisher
         still has the samples; `on_miss(key, count)` says what is lost for good (the key expression instead
-        of the key for a publisher of which nothing came yet).
+        of the key for a publisher of which nothing came yet), on a thread of its own.
 
         history: how many of the last samples of each publisher, there now or appearing later (also after an
         outage of the hub), come first; 0 none. With more than 1, a publisher that is frozen while we join
@@ -308,6 +310,7 @@ def _config(connect: Sequence[str], listen: Sequence[str], mode: str) -> zenoh.C
         "listen/endpoints": list(listen),
         "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
         "scouting/multicast/enabled": False,
+        "transport/unicast/open_timeout": round(1000 * HANDSHAKE),
         "timestamping/enabled": True,  # publishers that keep samples need it
         "transport/shared_memory/enabled": False,
         "transport/link/rx/max_message_size": 2 * MAX_BYTES,  # what is longer is dropped before it takes memory
@@ -324,8 +327,9 @@ def _config(connect: Sequence[str], listen: Sequence[str], mode: str) -> zenoh.C
 
 
 def _join(config: zenoh.Config, endpoints: str, wait: bool | float, stop: threading.Event | None) -> Any:
-    """A client's session. `zenoh.open` lets no signal through while it waits for an answer, which may take
-    seconds on a slow link: it runs on a thread of its own, and is left to itself if nobody waits any more."""
+    """A client's session. `zenoh.open` lets no signal through while it waits for an answer, up to `HANDSHAKE`:
+    it runs on a thread of its own, left to itself if nobody waits any more. Not a daemon thread: one that
+    comes back from Zenoh while the interpreter goes down aborts the process."""
     lock = threading.Lock()
     changed = threading.Event()
     abandoned = threading.Event()
@@ -350,7 +354,7 @@ def _join(config: zenoh.Config, endpoints: str, wait: bool | float, stop: thread
     begin = time.monotonic()
     deadline = None if wait is True or not wait else begin + wait
     remind = begin + 2 * RETRY
-    threading.Thread(target=attempt, name="bus-join", daemon=True).start()
+    threading.Thread(target=attempt, name="bus-join").start()
     try:
         while not changed.wait(0.05):
             now = time.monotonic()

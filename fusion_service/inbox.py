@@ -15,8 +15,9 @@ class Inbox(Generic[T]):
     """The one bounded queue between the bus and who works on what came. All methods are thread safe.
 
     It holds at most `capacity` slots; an item of `size` bytes takes 1 + size // slot_bytes of them, so that
-    memory is bounded whatever is sent. When they do not suffice, the oldest item of the busiest source, the
-    one that holds most slots, is dropped and counted: a flood costs the one who makes it. At most
+    memory is bounded whatever is sent. When they do not suffice, the oldest item of the busiest source is
+    dropped and counted: the one that holds most slots, among equals the one that has held them longest. So a
+    flood costs the one who makes it. At most
     `max_sources` names are told apart, waiting or counted; all beyond share one account, `OTHERS`.
     Every operation costs the same however much waits (amortised).
     """

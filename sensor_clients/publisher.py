@@ -1,0 +1,337 @@
+"""The kit for a client: publish what a sensor sees, what the sensor is, or (in a simulation) what is true.
+
+It loads NumPy, MessagePack and Zenoh, nothing else.
+"""
+
+from __future__ import annotations
+
+import operator
+import threading
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from typing import Any, Self, SupportsIndex, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from fusion_service.bus import DEFAULT_ENDPOINT, Bus, BusError, Publisher, open_bus
+from schemas import (
+    FAULTS,
+    ORIGINS,
+    REALM,
+    Coverage,
+    Frame,
+    Height,
+    LocalIntensity,
+    LocalTracks,
+    MessageError,
+    Motion,
+    SensorInfo,
+    Truth,
+    check_name,
+    check_numbers,
+    check_space,
+    encode,
+    local_key,
+    truth_key,
+)
+
+__all__ = ["TrackPublisher", "TruthPublisher"]
+
+ASYMMETRY = 1e-6
+"""The most that P_ij and P_ji may differ, as a part of sqrt(P_ii P_jj)."""
+
+M = TypeVar("M", LocalTracks, LocalIntensity, SensorInfo, Truth)
+
+
+class _MessagePublisher:
+    """One source's session: opens it, fills in the header, numbers the messages of each type."""
+
+    def __init__(
+        self,
+        source: str,
+        *,
+        connect: str | Sequence[str] = DEFAULT_ENDPOINT,
+        realm: str = REALM,
+        origin: str = "live",
+        lineage: Sequence[str] | None = None,
+        wait: bool | float = True,
+        stop: threading.Event | None = None,
+        clock: Callable[[], int] = time.time_ns,
+    ) -> None:
+        if origin not in ORIGINS:
+            raise ValueError(f"bad origin {origin!r}: one of {' '.join(ORIGINS)}")
+        self.source = check_name(source)
+        self.realm = realm
+        self.epoch = 0
+        self._origin = origin
+        self._lineage = None if lineage is None else tuple(check_name(name) for name in lineage)
+        self._connect = (connect,) if isinstance(connect, str) else tuple(connect)
+        self._wait = wait
+        self._stop = stop
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._bus: Bus | None = None
+        self._channels: dict[str, tuple[Publisher, int]] = {}
+        self._stack = ExitStack()
+
+    def __enter__(self) -> Self:
+        with ExitStack() as stack:
+            bus = stack.enter_context(open_bus(self._connect, wait=self._wait, stop=self._stop))
+            self._opened(bus)
+            self._bus, self.epoch = bus, self._clock()
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._lock:
+            self._bus = None
+            self._channels.clear()
+        self._stack.close()
+
+    def _opened(self, bus: Bus) -> None:
+        """What is declared as long as the session is open."""
+
+    @property
+    def connected(self) -> bool:
+        """Whether the hub is there at this moment. It is waited for and joined again by itself."""
+        bus = self._bus
+        return bus is not None and bus.connected
+
+    def _send(self, kind: type[M], key: str, cache: int, parts: dict[str, Any]) -> M:
+        with self._lock:
+            if self._bus is None:
+                raise BusError(f"the publisher of {self.source} is not open: use it in a `with` block")
+            channel, seq = self._channels.get(key) or (self._bus.publisher(key, cache), 0)
+            self._channels[key] = channel, seq
+            message = kind(
+                source=self.source,
+                epoch=self.epoch,
+                seq=seq,
+                sent=self._clock(),
+                origin=self._origin,
+                lineage=self._lineage,
+                **parts,
+            )
+            data = encode(message)
+            if isinstance(message, LocalTracks | LocalIntensity):
+                _check_densities(message)
+            channel.put(data)
+            self._channels[key] = channel, seq + 1
+            return message
+
+
+class TrackPublisher(_MessagePublisher):
+    """Publishes one source's tracks and what the source is, as a context manager:
+
+        import time
+        from schemas import Enu, Motion
+        from sensor_clients.publisher import TrackPublisher
+
+        site = Enu(lat=59.30, lon=10.40)
+        with TrackPublisher("radar-1", connect="tcp/127.0.0.1:7447") as radar:
+            radar.info(frame=site, position=(0, 0, 12), period=2.0, motion=Motion("cv", q=0.5))
+            for x in (1200, 1194, 1188):  # your tracker's loop
+                radar.tracks(time=time.time_ns(), space=("x", "y"), frame=site, ids=[7], means=[[x, 400]],
+                             covariances=[[[25, 0], [0, 25]]])
+
+    source: its name in the key. connect: endpoint or endpoints of the hub. realm: first part of every key.
+    origin: live, exercise, simulated or replay. lineage: the sources whose data the tracks contain, if not
+    only this one's. wait: for the hub for ever (True), so many seconds, or one try (False); `stop` ends the
+    waiting. clock: now, in ns UTC.
+
+    `{realm}/v1/local/{source}/alive` stands while it is open. Each opening is a new epoch, in which the
+    messages of each type are numbered from 0. If the hub goes away, what is published meanwhile is lost but
+    for the last eight messages of each type (the last info), which go out when it is back.
+
+    Raises `ValueError` for a bad name, `BusError` if it cannot connect or is not open, and
+    `schemas.MessageError` (with `reason`), before anything is sent, for what the centre would refuse.
+    """
+
+    def _opened(self, bus: Bus) -> None:
+        bus.announce(local_key(self.source, "alive", self.realm))
+
+    def info(
+        self,
+        *,
+        frame: Frame,
+        position: Sequence[float],
+        period: float,
+        motion: Motion,
+        coverage: Coverage | None = None,
+        detection_probability: float | None = None,
+        initiation_delay: float = 0.0,
+        may_start: bool = True,
+        position_covariance: ArrayLike | None = None,
+        correlation_group: str | None = None,
+    ) -> SensorInfo:
+        """Say what this source is (fields: `schemas.SensorInfo`; m, s). Who joins later gets it as well; say it
+        again whenever it changes."""
+        parts = {
+            "frame": frame,
+            "position": tuple(_floats("position", position, (3,)).tolist()),
+            "period": period,
+            "motion": motion,
+            "coverage": coverage,
+            "detection_probability": detection_probability,
+            "initiation_delay": initiation_delay,
+            "may_start": may_start,
+            "position_covariance": _maybe(_floats, "position_covariance", position_covariance, (3, 3)),
+            "correlation_group": correlation_group,
+        }
+        return self._send(SensorInfo, local_key(self.source, "info", self.realm), 1, parts)
+
+    def tracks(
+        self,
+        *,
+        time: SupportsIndex,
+        space: Sequence[str],
+        frame: Frame,
+        ids: ArrayLike,
+        means: ArrayLike,
+        covariances: ArrayLike,
+        complete: bool = True,
+        counts: ArrayLike | None = None,
+        weights: ArrayLike | None = None,
+        existence: ArrayLike | None = None,
+        updated: ArrayLike | None = None,
+        height: Height | None = None,
+        identity: Sequence[str | None] | None = None,
+        kind: Sequence[str | None] | None = None,
+        kind_p: ArrayLike | None = None,
+    ) -> LocalTracks:
+        """Publish T tracks that hold at `time` (ns UTC), as Gaussians or mixtures of C components in all.
+
+        space: n component names; ids (T,); means (C, n) and covariances (C, n, n) in `frame`, SI units. One
+        component per track unless `counts` (T,) says how many, with `weights` (C,) summing to 1 per track.
+        complete: this is all the source has, an id that is not listed is gone (T = 0 is then valid).
+        Optional per track: existence in [0, 1], updated (time of the last measurement, ns), identity
+        ("mmsi:...", "icao:..."), kind and kind_p; height: where a two-dimensional source's tracks are.
+        Arrays may be anything NumPy can read. `MessageError` names the track that is unsound.
+        """
+        names = _space(space)
+        parts = {
+            "time": _time(time),
+            "complete": bool(complete),
+            "space": names,
+            "frame": frame,
+            "ids": _whole("ids", ids, np.uint64),
+            "counts": _maybe(_whole, "counts", counts, np.uint16),
+            "weights": _maybe(_floats, "weights", weights, (None,)),
+            **_densities(means, covariances, len(names)),
+            "existence": _maybe(_floats, "existence", existence, (None,)),
+            "updated": _maybe(_whole, "updated", updated, np.int64),
+            "height": height,
+            "identity": None if identity is None else tuple(identity),
+            "kind": None if kind is None else tuple(kind),
+            "kind_p": _maybe(_floats, "kind_p", kind_p, (None,)),
+        }
+        return self._send(LocalTracks, local_key(self.source, "tracks", self.realm), 8, parts)
+
+    def intensity(
+        self,
+        *,
+        time: SupportsIndex,
+        space: Sequence[str],
+        frame: Frame,
+        weights: ArrayLike,
+        means: ArrayLike,
+        covariances: ArrayLike,
+        height: Height | None = None,
+    ) -> LocalIntensity:
+        """Publish an intensity (PHD) of C components: weights (C,), whose sum is the expected number, means
+        (C, n), covariances (C, n, n); the rest as in `tracks`."""
+        names = _space(space)
+        parts = {
+            "time": _time(time),
+            "space": names,
+            "frame": frame,
+            "weights": _floats("weights", weights, (None,)),
+            **_densities(means, covariances, len(names)),
+            "height": height,
+        }
+        return self._send(LocalIntensity, local_key(self.source, "intensity", self.realm), 8, parts)
+
+
+class TruthPublisher(_MessagePublisher):
+    """Publishes what is true in a scenario, for the record and for scores. Arguments as in `TrackPublisher`;
+    the scenario's name stands for the source's."""
+
+    def truth(
+        self, *, time: SupportsIndex, space: Sequence[str], frame: Frame, ids: ArrayLike, means: ArrayLike
+    ) -> Truth:
+        """Publish the true states `means` (T, n) of the objects `ids` (T,) at `time` (ns UTC) in `frame`."""
+        names = _space(space)
+        states = _floats("means", means, (None, len(names)))
+        if not np.isfinite(states).all():
+            raise MessageError("not-finite", "a true mean is not finite")
+        number = _whole("ids", ids, np.uint64)
+        parts = {"time": _time(time), "space": names, "frame": frame, "ids": number, "means": states}
+        return self._send(Truth, truth_key(self.source, self.realm), 8, parts)
+
+
+def _maybe(convert: Callable[..., Any], name: str, value: Any, *options: Any) -> Any:
+    return None if value is None else convert(name, value, *options)
+
+
+def _floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
+    """float64 of `shape`, None standing for any length; an empty one may come without its other axes."""
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise MessageError("bad-field", f"{name}: {error}") from None
+    if array.size == 0 and shape[0] is None:
+        return np.zeros([length or 0 for length in shape])
+    if len(shape) != array.ndim or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True)):
+        wanted = ", ".join("any" if length is None else str(length) for length in shape)
+        raise MessageError("length", f"{name} has shape {array.shape} where ({wanted}) belongs")
+    return array
+
+
+def _whole(name: str, value: ArrayLike, dtype: type[np.integer[Any]]) -> NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise MessageError("bad-field", f"{name}: {error}") from None
+    limits = np.iinfo(dtype)
+    if array.ndim != 1:
+        raise MessageError("length", f"{name} has shape {array.shape} where (any) belongs")
+    if array.size and (array.dtype.kind not in "iu" or array.min() < limits.min or array.max() > limits.max):
+        raise MessageError("bad-field", f"{name}: not whole numbers from {limits.min} to {limits.max}")
+    return array.astype(dtype)
+
+
+def _time(time: SupportsIndex) -> int:
+    try:
+        return operator.index(time)
+    except TypeError:
+        raise MessageError("bad-field", f"time: {time!r} is not whole nanoseconds, as time.time_ns() is") from None
+
+
+def _space(space: Sequence[str]) -> tuple[str, ...]:
+    try:
+        return check_space(tuple(space))
+    except (ValueError, TypeError) as error:
+        raise MessageError("bad-field", f"space: {error}") from None
+
+
+def _densities(means: ArrayLike, covariances: ArrayLike, n: int) -> dict[str, Any]:
+    return {
+        "means": _floats("means", means, (None, n)),
+        "covariances": _floats("covariances", covariances, (None, n, n)),
+    }
+
+
+def _check_densities(message: LocalTracks | LocalIntensity) -> None:
+    """Refuse what the centre would, and covariances that only seem sound because one triangle is sent."""
+    codes = check_numbers([message])[0]
+    bad = np.flatnonzero(codes)
+    if len(bad):
+        row = int(bad[0])
+        what = f"track {message.ids[row]}" if isinstance(message, LocalTracks) else f"component {row}"
+        raise MessageError(FAULTS[codes[row]], f"{what} of {message.source}")
+    scale = np.sqrt(np.diagonal(message.covariances, axis1=1, axis2=2))
+    gap = np.abs(message.covariances - message.covariances.swapaxes(1, 2))
+    if not (gap <= ASYMMETRY * scale[:, :, None] * scale[:, None, :]).all():
+        raise MessageError("bad-field", f"a covariance of {message.source} is not symmetric")

@@ -1,0 +1,99 @@
+"""Real processes for tests: a hub to kill and start again, programs that die with the test, waiting on conditions."""
+
+from __future__ import annotations
+
+import os
+import select
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from typing import Self
+
+HUB = """
+import sys, threading
+from fusion_service.hub import run_hub
+stop = threading.Event()
+threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
+run_hub([sys.argv[1]], stop)
+"""
+
+
+def free_endpoint() -> str:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"tcp/127.0.0.1:{server.getsockname()[1]}"
+
+
+def eventually(condition: Callable[[], object], timeout: float = 5.0) -> float:
+    """Wait until `condition()` holds; the seconds it took. Fails after `timeout`."""
+    begin = time.monotonic()
+    while not condition():
+        assert time.monotonic() - begin < timeout, f"did not happen within {timeout} s"
+        time.sleep(0.005)
+    return time.monotonic() - begin
+
+
+class Program:
+    """A Python program in a process of its own, killed at the end of the `with` block at the latest."""
+
+    def __init__(self, code: str, *arguments: str) -> None:
+        command = [sys.executable, "-W", "error", "-c", code, *arguments]
+        pipe = subprocess.PIPE
+        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
+        self._lines = b""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+        for pipe in (self._process.stdin, self._process.stdout, self._process.stderr):
+            assert pipe is not None
+            pipe.close()
+
+    def signal(self, number: signal.Signals) -> None:
+        self._process.send_signal(number)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def line(self, timeout: float = 10.0) -> str:
+        """The next line that it prints."""
+        pipe = self._process.stdout
+        assert pipe is not None
+        deadline = time.monotonic() + timeout
+        while b"\n" not in self._lines:
+            ready, _, _ = select.select([pipe], [], [], max(0.0, deadline - time.monotonic()))
+            assert ready, f"no line within {timeout} s"
+            part = os.read(pipe.fileno(), 65536)
+            if not part:
+                assert self._process.stderr is not None
+                raise AssertionError(f"it ended: {self._process.stderr.read().decode()}")
+            self._lines += part
+        line, _, self._lines = self._lines.partition(b"\n")
+        return line.decode()
+
+    def end(self, timeout: float = 10.0) -> tuple[int, str]:
+        """Wait for it to end by itself: (exit code, what it wrote to stderr)."""
+        _, errors = self._process.communicate(timeout=timeout)
+        return self._process.returncode, errors.decode()
+
+
+class Hub:
+    """A hub on a free loopback port, in a process that can be killed and started again."""
+
+    def __init__(self) -> None:
+        self.endpoint = free_endpoint()
+        self._program: Program | None = None
+
+    def start(self) -> Self:
+        self._program = Program(HUB, self.endpoint)
+        return self
+
+    def kill(self) -> None:
+        if self._program is not None:
+            self._program.__exit__()
+            self._program = None
