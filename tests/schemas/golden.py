@@ -1,0 +1,15 @@
+"""The golden messages as bytes, and changed ones."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgpack
+from make_vectors import VECTORS
+
+GOLDEN = {path.stem: path.read_bytes() for path in sorted(VECTORS.glob("*.msgpack"))}
+
+
+def changed(name: str, **values: Any) -> bytes:
+    """A golden message with other values in some fields."""
+    return bytes(msgpack.packb(msgpack.unpackb(GOLDEN[name]) | values))
