@@ -9,6 +9,7 @@ checked for many messages at once by `schemas.check_numbers`.
 from __future__ import annotations
 
 import hashlib
+from dataclasses import fields
 from typing import Any, cast
 
 import msgpack
@@ -26,6 +27,9 @@ MAX_BYTES = 16 * 2**20
 """A payload above this size is refused before it is read."""
 MAX_ITEMS = 2**16
 """A list with more items is refused: lists in lists that each announce millions cost far more than their bytes."""
+
+_SLOTS = {kind: [(field.name, getattr(kind, field.name).__set__) for field in fields(kind)] for kind in FIELDS}
+"""The attributes of each message, set one by one in `decode`: half the time of a frozen dataclass's own `__init__`."""
 
 
 def encode(message: Message) -> bytes:
@@ -51,13 +55,13 @@ def digest(message: Message) -> int:
 
 def _pack(message: Message) -> bytes:
     kind = type(message)
-    fields = FIELDS.get(kind)
-    if fields is None:
+    table = FIELDS.get(kind)
+    if table is None:
         raise MessageError("type", f"{kind.__name__} is not a message")
     out: dict[str, Any] = {"v": VERSION, "type": kind.type}
     key = ""
     try:
-        for key, _, get, pack, _, optional in fields:
+        for key, _, get, pack, _, optional in table:
             value = get(message)
             if value is not None or not optional:
                 out[key] = value if pack is None else pack(value)
@@ -103,4 +107,7 @@ def decode(data: bytes) -> Message:
     except (ValueError, TypeError) as error:
         raise MessageError("bad-field", f"{name}.{key}: {error}") from None
     SHAPE[kind](values)
-    return kind(**values)
+    message = object.__new__(kind)
+    for slot, put in _SLOTS[kind]:
+        put(message, values[slot])
+    return message

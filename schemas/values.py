@@ -44,12 +44,12 @@ def _full(n: int) -> NDArray[np.intp]:
 def pack_lower(matrices: Floats) -> Floats:
     """Lower triangles of (..., n, n), row by row: (..., n(n+1)/2)."""
     n = matrices.shape[-1]
-    return matrices.reshape(*matrices.shape[:-2], n * n).take(_lower(n), axis=-1)
+    return matrices.reshape(*matrices.shape[:-2], n * n).take(_lower(n), axis=-1, mode="clip")
 
 
 def unpack_lower(packed: Floats, n: int) -> Floats:
     """The symmetric (..., n, n) of packed lower triangles (..., n(n+1)/2)."""
-    return packed.take(_full(n), axis=-1)
+    return packed.take(_full(n), axis=-1, mode="clip")
 
 
 def exactly(kind: type, name: str) -> Convert:
@@ -127,12 +127,12 @@ def map_of(read: Convert) -> Convert:
 
 
 def free(value: Any, depth: int = 0) -> Any:
-    """nil, true, false, an integer, a float, a text, or lists and maps of these up to `MAX_DEPTH`."""
+    """nil, true, false, an integer, a float, a text, bytes, or lists and maps of these up to `MAX_DEPTH`."""
     kind = type(value)
-    if kind in (type(None), bool, int, float, str):
+    if kind in (type(None), bool, int, float, str, bytes):
         return value
     if kind not in (list, dict) or depth == MAX_DEPTH:
-        raise ValueError(f"not a plain value (numbers, texts, lists and maps, {MAX_DEPTH} deep)")
+        raise ValueError(f"not a plain value (numbers, texts, bytes, lists and maps, {MAX_DEPTH} deep)")
     read = partial(free, depth=depth + 1)
     return [read(item) for item in value] if kind is list else map_of(read)(value)
 
