@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import struct
 import sys
@@ -356,7 +357,12 @@ def test_cost_is_proportional(data: bytes) -> None:
 
 
 def test_hostile_texts_are_not_remembered() -> None:
-    before = sys.getallocatedblocks()
-    for index in range(2000):
-        reason(changed("local_tracks_full", source=f"{index} " + "x" * 100, space=[f"{index}"]))
-    assert sys.getallocatedblocks() - before < 1000
+    def refuse(count: int) -> int:
+        for index in range(count):
+            bad = {"source": f"{index} " + "x" * 100}, {"space": [f"{index}"]}, {"frame": {"kind": f"{index}"}}
+            assert {reason(changed("local_tracks_full", **values)) for values in bad} == {"bad-field"}
+        gc.collect()
+        return sys.getallocatedblocks()
+
+    before = refuse(100)
+    assert refuse(2000) - before < 1000
