@@ -103,6 +103,7 @@ def _record(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.recording import default_path, run_recorder
 
     path = Path(args.out) if args.out else default_path()
+    path.parent.mkdir(parents=True, exist_ok=True)
     with open_bus(args.connect or [ENDPOINT], stop=stop) as bus:
         run_recorder(bus, path, realm=args.realm, stop=stop)
 

@@ -84,13 +84,11 @@ class MessageClock:
         if not self._newest:
             return None
         front = max(self._newest.values())
-        if self._next is None:
-            self._next = -(-self._times[0] // self._period) * self._period
-        while self._times and self._times[0] <= self._next - self._period:
+        time = -(-self._times[0] // self._period) * self._period if self._next is None else self._next
+        while self._times and self._times[0] <= time - self._period:
             heapq.heappop(self._times)
-        if self._times and self._times[0] > self._next + self.IDLE * self._period:
-            self._next = self._times[0] // self._period * self._period
-        time = self._next
+        if self._times and self._times[0] > time + self.IDLE * self._period:
+            time = self._times[0] // self._period * self._period
         live = [name for name in {*self._token, *self._newest} if self._is_live(name)]
         reached = time <= front and all(self._newest.get(name, -1) >= time for name in live)
         if not reached and front <= time + self._lateness:

@@ -107,10 +107,10 @@ class Service:
                 timeout = min(timeout, self._wall_clock.wait(time.time_ns()))
             for _, item in self._inbox.take(timeout):
                 self._receive(item)
-            self._note_tokens()
+            changed = self._note_tokens()
             self._note_drops()
             self._step_all(stop)
-            if time.monotonic() >= status_due:
+            if changed or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
                 self._publish_status()
                 _notify("WATCHDOG=1")
@@ -182,7 +182,9 @@ class Service:
         horizon = received + round(self._config.centre.max_future * 1e9)
         return at <= horizon and self._message_clock.observe(name, at)
 
-    def _note_tokens(self) -> None:
+    def _note_tokens(self) -> bool:
+        """Tell the centre which sources came and went; whether any did."""
+        changed = False
         for name, alive in list(self._tokens.items()):
             if self._seen_tokens.get(name) is not alive:
                 self._seen_tokens[name] = alive
@@ -190,6 +192,8 @@ class Service:
                 self._centre.handle(SourceFound(name) if alive else SourceLost(name), time.time_ns())
                 if self._message_clock is not None:
                     self._message_clock.presence(name, alive)
+                changed = True
+        return changed
 
     def _note_drops(self) -> None:
         for name, total in self._inbox.dropped.items():
@@ -211,6 +215,8 @@ class Service:
             result = self._centre.step(at)
             self._blob = self._centre.checkpoint()
             self._state.save(self._blob)
+            sent = time.time_ns()
+            picture, journal = (encode(dataclasses.replace(part, sent=sent)) for part in (result.tracks, result.log))
         except Exception:
             log.exception("the step at %d failed: going on from the last checkpoint", at)
             self._counts["failed_steps"] += 1
@@ -222,10 +228,9 @@ class Service:
         self._step_seconds["last"] = seconds
         self._step_seconds["max"] = max(self._step_seconds["max"], seconds)
         self._step_seconds["total"] += seconds
-        sent = time.time_ns()
-        self._picture = encode(dataclasses.replace(result.tracks, sent=sent))
-        self._out["tracks"].put(self._picture)
-        self._out["log"].put(encode(dataclasses.replace(result.log, sent=sent)))
+        self._picture = picture
+        self._out["tracks"].put(picture)
+        self._out["log"].put(journal)
         self._log_refusals(result.status)
 
     def _log_refusals(self, status: Status) -> None:

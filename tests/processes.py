@@ -60,6 +60,9 @@ class Program:
         self._process.kill()
         self._process.wait()
 
+    def running(self) -> bool:
+        return self._process.poll() is None
+
     def line(self, timeout: float = 10.0) -> str:
         """The next line that it prints."""
         pipe = self._process.stdout
@@ -90,7 +93,8 @@ class Hub:
         self._program: Program | None = None
 
     def start(self) -> Self:
-        self._program = Program(HUB, self.endpoint)
+        if self._program is None:
+            self._program = Program(HUB, self.endpoint)
         return self
 
     def kill(self) -> None:
