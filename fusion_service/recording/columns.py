@@ -1,0 +1,199 @@
+"""Rows that wait for one `send_columns` per entity.
+
+A row logged alone costs Rerun 75-90 us, a row of a column about one: every message of a tick adds its rows
+here, and `Columns.send` writes them, one chunk for each entity, into the recording.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["Columns", "Lines", "Points", "Stamp", "documents", "entity", "import_rerun", "raw", "scalars", "texts"]
+
+log = logging.getLogger(__name__)
+
+Floats = NDArray[np.float64]
+Colours = NDArray[np.uint32]
+
+
+def import_rerun() -> Any:
+    """The `rerun` package, imported when first needed (1.8 s). `ImportError` says how to get it."""
+    try:
+        import rerun
+    except ImportError as error:
+        raise ImportError(f"recording needs rerun-sdk ({error}): pip install 'track-fusion-centre[record]'") from error
+    return rerun
+
+
+@lru_cache(maxsize=4096)
+def entity(*parts: str) -> str:
+    """The entity path of `parts`, each escaped."""
+    path: str = import_rerun().new_entity_path(list(parts))
+    return path
+
+
+class Stamp(NamedTuple):
+    """Where a row stands: receive time and mission time in ns UTC, arrival number of a raw message."""
+
+    received: int
+    time: int | None = None
+    arrival: int | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Points:
+    """T points of one row: plane (T, 2) as Rerun draws it, east and -north in m; geo (T, 2) latitude and longitude
+    in degrees, None in a frame without a place on Earth; colours (T,) as 0xRRGGBBAA, None for the entity's own."""
+
+    plane: Floats
+    geo: Floats | None
+    labels: list[str] | None = None
+    colours: Colours | None = None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Lines:
+    """S line strips of one row, one after the other: plane (P, 2) and geo (P, 2) as in `Points`; lengths (S,)."""
+
+    plane: Floats
+    geo: Floats | None
+    lengths: NDArray[np.int64]
+    colours: Colours | None = None
+    labels: list[str] | None = None
+
+
+Build = Callable[[Any, Sequence[Any]], list[Any]]
+
+
+class Columns:
+    """Rows by entity, written to `stream` (a `rerun.RecordingStream`) by `send`."""
+
+    def __init__(self, stream: Any) -> None:
+        self._rr = import_rerun()
+        self._stream = stream
+        self._rows: dict[tuple[str, Build, bool, bool], list[tuple[Stamp, Any]]] = {}
+        self.waiting = 0
+        self.sent = 0
+        self.failed = 0
+
+    def add(self, path: str, build: Build, stamp: Stamp, content: Any) -> None:
+        """One row of `content` (what `build` takes) for the entity `path`."""
+        key = (path, build, stamp.time is None, stamp.arrival is None)
+        self._rows.setdefault(key, []).append((stamp, content))
+        self.waiting += 1
+
+    def points(self, path: str, stamp: Stamp, content: Points) -> None:
+        self.add(path, _points, stamp, content)
+
+    def lines(self, path: str, stamp: Stamp, content: Lines) -> None:
+        self.add(path, _lines, stamp, content)
+
+    def scalar(self, path: str, stamp: Stamp, value: float) -> None:
+        self.add(path, scalars, stamp, value)
+
+    def static(self, path: str, *archetypes: Any) -> None:
+        """What holds at all times; the last one said counts."""
+        self._stream.log(path, *archetypes, static=True)
+
+    def send(self) -> None:
+        """Write every row that waits, each entity's in the order they were added."""
+        rr, rows, self._rows = self._rr, self._rows, {}
+        self.waiting = 0
+        for (path, build, timeless, uncounted), added in rows.items():
+            stamps = [stamp for stamp, _ in added]
+            indexes = [_timestamps(rr, "received", [stamp.received for stamp in stamps])]
+            if not timeless:
+                indexes.append(_timestamps(rr, "time", [stamp.time for stamp in stamps]))
+            if not uncounted:
+                indexes.append(rr.TimeColumn("arrival", sequence=[stamp.arrival for stamp in stamps]))
+            try:
+                self._stream.send_columns(path, indexes, build(rr, [content for _, content in added]), strict=True)
+            except Exception:
+                self.failed += len(added)
+                log.exception("%d rows of %s cannot be written", len(added), path)
+            else:
+                self.sent += len(added)
+
+
+def _timestamps(rr: Any, name: str, times: Sequence[int | None]) -> Any:
+    return rr.TimeColumn(name, timestamp=np.array(times, dtype=np.int64).astype("datetime64[ns]"))
+
+
+def raw(rr: Any, rows: Sequence[tuple[str, bytes]]) -> list[Any]:
+    """Columns `RawMessage:key` and `RawMessage:msg` of messages as they came; one archetype, so that no tool that
+    rearranges the file takes them apart."""
+    import pyarrow as pa
+
+    keys, blobs = zip(*rows, strict=True)
+    components = {"key": pa.array(keys, pa.string()), "msg": pa.array(blobs, pa.binary())}
+    return [*rr.DynamicArchetype.columns(archetype="RawMessage", components=components)]
+
+
+def scalars(rr: Any, rows: Sequence[float]) -> list[Any]:
+    """Points of a time series; NaN breaks the line."""
+    return [*rr.Scalars.columns(scalars=np.array(rows, dtype=np.float64))]
+
+
+def texts(rr: Any, rows: Sequence[tuple[str, str]]) -> list[Any]:
+    """Lines of a log: (level, text)."""
+    levels, lines = zip(*rows, strict=True)
+    return [*rr.TextLog.columns(text=list(lines), level=list(levels))]
+
+
+def documents(rr: Any, rows: Sequence[str]) -> list[Any]:
+    """Documents in Markdown."""
+    return [*rr.TextDocument.columns(text=list(rows), media_type=["text/markdown"] * len(rows))]
+
+
+def _points(rr: Any, rows: Sequence[Points]) -> list[Any]:
+    lengths = [len(row.plane) for row in rows]
+    plane: dict[str, Any] = {"positions": np.concatenate([row.plane for row in rows])}
+    geo: dict[str, Any] = {}
+    if rows[0].geo is not None:
+        geo["positions"] = np.concatenate([row.geo for row in rows if row.geo is not None])
+    if rows[0].labels is not None:
+        plane["labels"] = [label for row in rows for label in row.labels or ()]
+    if rows[0].colours is not None:
+        plane["colors"] = geo["colors"] = _colours(rows)
+    columns = [*rr.Points2D.columns(**plane)]
+    if "positions" in geo:
+        columns += rr.GeoPoints.columns(**geo)
+    return [column.partition(lengths) for column in columns]
+
+
+def _lines(rr: Any, rows: Sequence[Lines]) -> list[Any]:
+    import pyarrow as pa
+
+    lengths = [len(row.lengths) for row in rows]
+    offsets = np.concatenate([[0], *(row.lengths for row in rows)]).cumsum().astype(np.int32)
+
+    def strips(points: Sequence[Floats | None], kind: Any, batch: Any) -> Any:
+        flat = pa.array(np.concatenate([part for part in points if part is not None]).ravel(), type=kind)
+        pairs = pa.FixedSizeListArray.from_arrays(flat, type=batch([])._ARROW_DATATYPE.value_type)
+        return pa.ListArray.from_arrays(pa.array(offsets), pairs, type=batch([])._ARROW_DATATYPE)
+
+    plane = {"strips": strips([row.plane for row in rows], pa.float32(), rr.components.LineStrip2DBatch)}
+    geo = {}
+    if rows[0].geo is not None:
+        geo["line_strings"] = strips([row.geo for row in rows], pa.float64(), rr.components.GeoLineStringBatch)
+    if rows[0].colours is not None:
+        plane["colors"] = geo["colors"] = _colours(rows)
+    if rows[0].labels is not None:
+        plane["labels"] = [label for row in rows for label in row.labels or ()]
+    columns = [*rr.LineStrips2D.columns(**plane)]
+    if "line_strings" in geo:
+        columns += rr.GeoLineStrings.columns(**geo)
+    return [column.partition(lengths) for column in columns]
+
+
+def _colours(rows: Sequence[Points] | Sequence[Lines]) -> Any:
+    import pyarrow as pa
+
+    return pa.array(np.concatenate([row.colours for row in rows if row.colours is not None]), type=pa.uint32())

@@ -1,0 +1,138 @@
+"""What happened, as lines of text and a page of health.
+
+/log/{about}         one line per event: refusals, sources, tracks, service, recorder
+/health/{centre}     the newest status as a page
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from datetime import UTC, datetime
+from typing import Any
+
+from fusion_service.recording.columns import Columns, Stamp, documents, entity, texts
+from fusion_service.recording.drawing import track_label
+from schemas import GlobalTracks, Status, StepLog
+
+__all__ = ["Journal"]
+
+INFO, WARN = "INFO", "WARN"
+SAID_ELSEWHERE = ("found", "lost", "restarted")
+"""Events of a service that its status, or the epoch of the messages, shows as well."""
+
+
+class Journal:
+    """Turns messages into lines; repeats of one fault within a message become one line with a number."""
+
+    def __init__(self, columns: Columns) -> None:
+        self._columns = columns
+        self._epochs: dict[tuple[str, str], int] = {}
+        self._health: dict[tuple[str, str], str] = {}
+        self._waiting: list[tuple[str, str, str, int]] = []
+
+    def say(self, about: str, level: str, text: str, stamp: Stamp) -> None:
+        """One line. What has no mission time waits for the next that has."""
+        if stamp.time is None:
+            self._waiting.append((about, level, text, stamp.received))
+            return
+        self.release(stamp.time)
+        self._columns.add(entity("log", about), texts, stamp, (level, f"{_clock(stamp.time)}  {text}"))
+
+    def release(self, time: int | None) -> None:
+        """Write the lines that wait for a mission time with this one (None: with none)."""
+        for about, level, text, received in self._waiting:
+            shown = text if time is None else f"{_clock(time)}  {text}"
+            self._columns.add(entity("log", about), texts, Stamp(received, time), (level, shown))
+        self._waiting.clear()
+
+    def begin(self, kind: str, name: str, epoch: int, stamp: Stamp) -> bool:
+        """Note the run of a source or service; whether it is a new one."""
+        before = self._epochs.get((kind, name))
+        if before == epoch:
+            return False
+        self._epochs[kind, name] = epoch
+        verb = "appears" if before is None else "has been started again"
+        self.say(f"{kind}s", INFO if before is None else WARN, f"{kind} {name} {verb} (epoch {_utc(epoch)})", stamp)
+        return True
+
+    def alive(self, scope: str, name: str, alive: bool, stamp: Stamp) -> None:
+        kind = "source" if scope == "local" else "service"
+        text = f"{kind} {name} {'is on the bus' if alive else 'has left the bus'}"
+        self.say(f"{kind}s", INFO if alive else WARN, text, stamp)
+
+    def status(self, message: Status, stamp: Stamp) -> list[str]:
+        """A line per source whose health changed, and the page. Returns the sources that were just lost."""
+        lost = []
+        for name, said in message.sources.items():
+            state = _state(said)
+            before = self._health.get((message.source, name))
+            self._health[message.source, name] = state
+            if before is not None and before != state:
+                self.say("sources", INFO if state == "alive" else WARN, f"source {name}: {before} -> {state}", stamp)
+            if state == "lost" and before != state:
+                lost.append(name)
+        self._columns.add(entity("health", message.source), documents, stamp, _page(message))
+        return lost
+
+    def step(self, message: StepLog, stamp: Stamp) -> None:
+        """Refusals and drops by source and reason, the service's own events."""
+        for verb, entries in (("refused", message.refused), ("dropped", message.dropped)):
+            counts = Counter[tuple[str, str, str]]()
+            for entry in entries:
+                counts[entry.source, entry.reason, "tracks" if entry.count else "messages"] += entry.count or 1
+            for (source, reason, what), count in sorted(counts.items()):
+                self.say("refusals", WARN, f"{verb} {count} {what} of {source}: {reason}", stamp)
+        for event in message.events:
+            kind = str(event.get("kind", "event"))
+            if kind in SAID_ELSEWHERE:
+                continue
+            rest = ", ".join(f"{key} {_short(value)}" for key, value in event.items() if key not in ("kind", "epoch"))
+            self.say("services", INFO, f"service {message.source}: {kind}{f' ({rest})' if rest else ''}", stamp)
+
+    def tracks(self, message: GlobalTracks, stamp: Stamp) -> None:
+        """Ended, merged and split global tracks."""
+        for track, reason, heir in message.ended:
+            into = f", goes on as {track_label(heir)}" if heir is not None else ""
+            self.say("tracks", INFO, f"track {track_label(track)} ended: {reason}{into}", stamp)
+        for new, old in message.split_from:
+            self.say("tracks", INFO, f"track {track_label(new)} split from {track_label(old)}", stamp)
+
+
+def _state(said: dict[str, Any]) -> str:
+    if not said.get("alive", True):
+        return "lost"
+    return "stale" if said.get("stale") else "alive"
+
+
+def _short(value: Any) -> str:
+    return f"{len(value)} bytes" if isinstance(value, bytes) else str(value)[:120]
+
+
+def _utc(time: int) -> str:
+    return datetime.fromtimestamp(time // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+
+
+def _clock(time: int) -> str:
+    return datetime.fromtimestamp(time // 10**9, UTC).strftime("%H:%M:%S")
+
+
+def _page(message: Status) -> str:
+    tracks = ", ".join(f"{count} {name}" for name, count in message.tracks.items())
+    lines = [f"# {message.source}", f"step {message.step}, up {message.uptime:.0f} s, tracks: {tracks or 'none'}", ""]
+    lines += ["| source | state | messages | tracks | offset s | gaps | repeats |", "|---|---|---|---|---|---|---|"]
+    for name, said in message.sources.items():
+        cells = [said.get(key, "") for key in ("messages", "tracks", "offset", "gaps", "repeats")]
+        shown = [f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in cells]
+        lines.append(f"| {' | '.join([name, _state(said), *shown])} |")
+    for title, numbers in (
+        ("refused", message.refused),
+        ("dropped", message.dropped),
+        ("queue", message.queue),
+        ("rates", message.rates),
+        ("step time", message.step_time),
+    ):
+        if numbers:
+            lines += ["", f"**{title}**: " + ", ".join(f"{key} {value:g}" for key, value in numbers.items())]
+    if message.memory is not None:
+        lines += ["", f"**memory**: {message.memory / 2**20:.0f} MiB"]
+    return "\n".join(lines)
