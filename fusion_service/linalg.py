@@ -51,6 +51,9 @@ FloatArray = NDArray[np.float64]
 CACHE_BYTES = 1 << 19
 """What one block's (n, n, B) array may occupy: half a megabyte, some 4,000 matrices at n = 4."""
 
+TURN = 128
+"""Elements transposed at a time: five times faster than a long array at once."""
+
 
 def to_last(a: FloatArray, core: int) -> FloatArray:
     """Flatten the leading batch axes of `a` and move them last: (..., *core axes) -> (*core axes, B).
@@ -61,7 +64,9 @@ def to_last(a: FloatArray, core: int) -> FloatArray:
     batch, shape = a.shape[: a.ndim - core], a.shape[a.ndim - core :]
     size, entries = prod(batch), prod(shape)
     out = np.empty((*shape, size))
-    out.reshape(entries, size)[...] = a.reshape(size, entries).T
+    tall, wide = a.reshape(size, entries), out.reshape(entries, size)
+    for i in range(0, size, TURN):
+        wide[:, i : i + TURN] = tall[i : i + TURN].T
     return out
 
 
@@ -70,13 +75,15 @@ def to_first(a: FloatArray, batch: tuple[int, ...], core: int) -> FloatArray:
     shape = a.shape[:core]
     size, entries = prod(batch), prod(shape)
     out = np.empty((*batch, *shape))
-    out.reshape(size, entries)[...] = a.reshape(entries, size).T
+    tall, wide = out.reshape(size, entries), a.reshape(entries, size)
+    for i in range(0, size, TURN):
+        tall[i : i + TURN] = wide[:, i : i + TURN].T
     return out
 
 
 def blocks(n: int, size: int, copies: int = 1) -> Iterator[slice]:
     """Slices that cut a batch of `size` elements, each of `copies` n x n matrices, into pieces for the cache."""
-    step = max(256, CACHE_BYTES // (8 * n * n * copies))
+    step = min(4096, max(256, CACHE_BYTES // (8 * n * n * max(copies, 1))))
     return (slice(i, min(i + step, size)) for i in range(0, size, step))
 
 
@@ -86,48 +93,51 @@ def inverse(P: FloatArray) -> FloatArray:
 
 
 def sweep(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """P^-1 (n, n, B), det P (B,) and margin (B,) in one elimination (Gauss-Jordan on the lower triangle).
+    """P^-1 (n, n, B), det P (B,) and margin (B,), in one elimination.
 
     The margin is the smallest pivot relative to its diagonal entry, NaN or negative for a bad matrix:
     `margin > tolerance` is `is_positive_definite(P, tolerance)`.
     """
-    n, batch = P.shape[0], P.shape[2:]
-    flat = P.reshape(n, n, prod(batch))
-    out, det_out, margin = np.empty_like(flat), np.empty_like(flat[0, 0]), np.empty_like(flat[0, 0])
+    out = np.empty(P.shape, P.dtype)
+    det, margin = np.empty(P.shape[2:], P.dtype), np.empty(P.shape[2:], P.dtype)
+    copies = prod(P.shape[2:-1])
     with np.errstate(all="ignore"):
-        for part in blocks(n, flat.shape[2]):
-            _sweep(flat[:, :, part], out[:, :, part], det_out[part], margin[part])
-    return out.reshape(n, n, *batch), det_out.reshape(batch), margin.reshape(batch)
+        for part in blocks(len(P), P.shape[-1], copies):
+            _sweep(P[..., part], out[..., part], det[..., part], margin[..., part])
+    return out, det, margin
 
 
-def _sweep(P: FloatArray, out: FloatArray, product: FloatArray, margin: FloatArray) -> None:
-    n = P.shape[0]
-    product[...] = 1.0
-    margin[...] = P[0, 0] / np.abs(P[0, 0])
+def _sweep(P: FloatArray, out: FloatArray, det: FloatArray, margin: FloatArray) -> None:
+    """P^-1 = W' D^-1 W with W = L^-1, as LAPACK's potri does it."""
+    n = len(P)
     A = np.empty(P.shape, P.dtype)
+    N = np.empty(P.shape, P.dtype)  # -L, then W, below the diagonal
+    r = np.empty(P.shape[1:], P.dtype)
     for i in range(n):
         A[i, : i + 1] = P[i, : i + 1]
-    column = np.empty_like(A[0])
-    scratch = np.empty_like(column)
     for k in range(n):
-        column[:k] = A[k, :k]
-        column[k + 1 :] = A[k + 1 :, k]
-        column[k] = 0.0
-        product *= A[k, k]
-        pivot = 1.0 / A[k, k]
+        d = A[k, k]
         if k:
-            np.minimum(margin, A[k, k] / np.abs(P[k, k]), out=margin)
-        row = column * pivot
-        for i in range(n):
-            if i == k:
-                continue
-            np.multiply(row[: i + 1], column[i], out=scratch[: i + 1])
-            A[i, : i + 1] -= scratch[: i + 1]
-        A[k, :k] = row[:k]
-        A[k + 1 :, k] = row[k + 1 :]
-        np.negative(pivot, out=A[k, k])
-    for i in range(n):
-        np.negative(A[i, : i + 1], out=out[i, : i + 1])
+            det *= d
+            np.minimum(margin, d / np.abs(P[k, k]), out=margin)
+        else:
+            det[...] = d
+            margin[...] = d / np.abs(d)
+        np.divide(1.0, d, out=r[k])
+        np.multiply(A[k + 1 :, k], -r[k], out=N[k + 1 :, k])
+        for i in range(k + 1, n):
+            A[i, k + 1 : i + 1] += N[i, k] * A[k + 1 : i + 1, k]
+    for i in range(2, n):
+        row = N[i, :i].copy()
+        for k in range(1, i):
+            N[i, :k] += row[k] * N[k, :k]
+    for k in range(n):
+        scaled = N[k, :k] * r[k]
+        out[k, :k] = scaled
+        out[k, k] = r[k]
+        for i in range(k):
+            out[i, : i + 1] += scaled[i] * N[k, : i + 1]
+    for i in range(1, n):
         out[:i, i] = out[i, :i]
 
 

@@ -6,8 +6,9 @@ fusion is computed again in longdouble; where even this could be wrong by more t
 (Where longdouble is no wider than double, everything that needs it is refused.)
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from math import prod
 from types import MappingProxyType
 from typing import Any
 
@@ -121,17 +122,29 @@ def fuse(
     if not N or not n:
         raise RuleError(f"means {x.shape}: at least one source and one component are needed")
     shape = tuple(batch)
-    xs, Ps = linalg.to_last(x, 2), linalg.to_last(P, 3)
+    function, chosen = _prepare(rule, N, options)
     w = _weights(rule, weights, (*shape, N))
-    _symmetric(Ps, shape)
-    fused = fuse_last(rule, xs, Ps, w, influence=influence, **options)
-    if not (np.isfinite(fused.covariance[0, 0]).all() and np.isfinite(fused.mean).all()):
-        raise RuleError(_complaint(xs, Ps, fused, shape))
+    size = prod(shape)
+    x, P = x.reshape(size, N, n), P.reshape(size, N, n, n)
+    mean, covariance, out_weights = np.empty((size, n)), np.empty((size, n, n)), np.empty((size, N))
+    shares = np.empty((size, N)) if influence else None
+    for part in _parts(size, N, n):
+        xs, Ps = linalg.to_last(x[part], 2), linalg.to_last(P[part], 3)
+        _symmetric(Ps, part.start, shape)
+        result = _run(function, xs, Ps, None if w is None else w[part].T, influence, chosen)
+        if not (np.isfinite(result.covariance[0, 0]).all() and np.isfinite(result.mean).all()):
+            raise RuleError(_complaint(xs, Ps, result, part.start, shape))
+        count = (len(result.condition),)
+        mean[part] = linalg.to_first(result.mean, count, 1)
+        covariance[part] = linalg.to_first(result.covariance, count, 2)
+        out_weights[part] = result.weights.T
+        if shares is not None and result.influence is not None:
+            shares[part] = result.influence.T
     return Fused(
-        linalg.to_first(fused.mean, shape, 1),
-        linalg.to_first(fused.covariance, shape, 2),
-        linalg.to_first(fused.weights, shape, 1),
-        None if fused.influence is None else linalg.to_first(fused.influence, shape, 1),
+        mean.reshape(*shape, n),
+        covariance.reshape(*shape, n, n),
+        out_weights.reshape(*shape, N),
+        None if shares is None else shares.reshape(*shape, N),
     )
 
 
@@ -152,30 +165,29 @@ def fuse_last(
     on the others. Raises RuleError for an unknown rule or option, and nothing else.
     """
     N, n, size = means.shape
-    function, chosen = _FUNCTIONS.get(rule), _options(rule, N, options)
-    assert function is not None
+    function, chosen = _prepare(rule, N, options)
     fused = Fused(
         np.empty((n, size)),
         np.empty((n, n, size)),
         np.empty((N, size)),
         np.empty((N, size)) if influence else None,
     )
-    with np.errstate(all="ignore"):
-        for part in linalg.blocks(n, size, max(N, 4)):
-            w = None if weights is None else weights[:, part]
-            sources = Sources.of(means[..., part], covariances[..., part])
-            result = function(sources, w, influence, **chosen)
-            _store(fused, part, result)
-            doubtful = ~((result.condition <= FAST_CONDITION) & (result.gap <= GAP) & sources.definite)
-            if doubtful.any():
-                at = np.flatnonzero(doubtful)
-                again = _safely(function, means[..., part][..., at], covariances[..., part][..., at],
-                                None if w is None else w[:, at], influence, chosen)  # fmt: skip
-                _store(fused, at + part.start, again)
+    for part in _parts(size, N, n):
+        w = None if weights is None else weights[:, part]
+        result = _run(function, means[..., part], covariances[..., part], w, influence, chosen)
+        fused.mean[:, part] = result.mean
+        fused.covariance[..., part] = result.covariance
+        fused.weights[:, part] = result.weights
+        if fused.influence is not None:
+            fused.influence[:, part] = result.influence
     return fused
 
 
-def _safely(
+def _parts(size: int, N: int, n: int) -> Iterator[slice]:
+    return linalg.blocks(n, size, max(N, 2))
+
+
+def _run(
     function: Callable[..., Result],
     means: FloatArray,
     covariances: FloatArray,
@@ -183,26 +195,46 @@ def _safely(
     influence: bool,
     chosen: dict[str, Any],
 ) -> Result:
-    """In longdouble; NaN where this is not good enough."""
-    wide = np.longdouble
-    sources = Sources.of(means.astype(wide), covariances.astype(wide))
-    result = function(sources, None if weights is None else weights.astype(wide), influence, **chosen)
-    bad = ~((result.condition <= SAFE_CONDITION) & (result.gap <= GAP) & sources.definite)
-    for a in (result.mean, result.covariance, result.weights, result.influence):
-        if a is not None:
-            a[..., bad] = np.nan
-    return result
+    """One block; what float64 cannot carry again in longdouble, and NaN where this is not good enough."""
+    with np.errstate(all="ignore"):
+        sources = Sources.of(means, covariances)
+        result = function(sources, weights, influence, **chosen)
+        limit = FAST_CONDITION if sources.fast else SAFE_CONDITION
+        doubtful = ~((result.condition <= limit) & (result.gap <= GAP) & sources.definite)
+        if not doubtful.any():
+            return result
+        share = None if result.influence is None else np.array(result.influence)
+        result = replace(
+            result,
+            mean=np.array(result.mean),
+            covariance=np.array(result.covariance),
+            weights=np.array(result.weights),
+            influence=share,
+        )
+        at = np.flatnonzero(doubtful)
+        if sources.fast:
+            w = None if weights is None else _wide(weights[:, at])
+            again = _run(function, _wide(means[..., at]), _wide(covariances[..., at]), w, influence, chosen)
+            _overwrite(result, at, again.mean, again.covariance, again.weights, again.influence)
+        else:
+            _overwrite(result, at, np.nan, np.nan, np.nan, np.nan)
+        return result
 
 
-def _store(fused: Fused, at: Any, result: Result) -> None:
-    fused.mean[:, at] = result.mean
-    fused.covariance[:, :, at] = result.covariance
-    fused.weights[:, at] = result.weights
-    if fused.influence is not None and result.influence is not None:
-        fused.influence[:, at] = result.influence
+def _wide(a: FloatArray) -> FloatArray:
+    out: Any = a.astype(np.longdouble)
+    return out  # type: ignore[no-any-return]
 
 
-def _options(rule: str, N: int, given: dict[str, Any]) -> dict[str, Any]:
+def _overwrite(result: Result, at: NDArray[np.intp], mean: Any, covariance: Any, weights: Any, share: Any) -> None:
+    result.mean[:, at] = mean
+    result.covariance[..., at] = covariance
+    result.weights[:, at] = weights
+    if result.influence is not None:
+        result.influence[:, at] = share
+
+
+def _prepare(rule: str, N: int, given: dict[str, Any]) -> tuple[Callable[..., Result], dict[str, Any]]:
     if rule not in RULES:
         raise RuleError(f"unknown rule {rule!r}: one of {', '.join(RULES)}")
     known = RULES[rule].options
@@ -214,7 +246,7 @@ def _options(rule: str, N: int, given: dict[str, Any]) -> dict[str, Any]:
         raise RuleError(f"criterion {chosen['criterion']!r}: one of {', '.join(CRITERIA)}")
     if "max_correlation" in chosen:
         chosen["max_correlation"] = _bound(chosen["max_correlation"], N)
-    return chosen
+    return _FUNCTIONS[rule], chosen
 
 
 def _bound(value: Any, N: int) -> FloatArray:
@@ -237,6 +269,7 @@ def _array(name: str, value: Any) -> FloatArray:
 
 
 def _weights(rule: str, weights: ArrayLike | str | None, shape: tuple[int, ...]) -> FloatArray | None:
+    """(size, N), checked."""
     if weights is None:
         return None
     if rule in RULES and not RULES[rule].takes_weights:
@@ -252,39 +285,42 @@ def _weights(rule: str, weights: ArrayLike | str | None, shape: tuple[int, ...])
         raise RuleError(f"weights {w.shape} do not fit {shape} (..., N)") from None
     if not ((w >= 0.0).all() and (np.abs(w.sum(axis=-1) - 1.0) <= 1e-9).all()):
         raise RuleError("weights must be non-negative with sum 1 over the sources")
-    return linalg.to_last(w, 1)
+    return w.reshape(prod(shape[:-1]), shape[-1])
 
 
-def _symmetric(P: FloatArray, batch: tuple[int, ...]) -> None:
+def _symmetric(P: FloatArray, start: int, batch: tuple[int, ...]) -> None:
     """Raise unless every P (N, n, n, B) is symmetric up to rounding. NaN passes: it is found later."""
     for i in range(1, P.shape[1]):
-        a, b = P[:, i, :i], P[:, :i, i]
-        if (a == b).all():
+        lower, upper = P[:, i, :i], P[:, :i, i]
+        if (lower == upper).all():
             continue
         with np.errstate(all="ignore"):
-            limit = 1e-9 * np.sqrt(P[:, i, i, None] * np.moveaxis(P.diagonal(axis1=1, axis2=2), 1, 2)[:, :i])
-            bad = np.abs(a - b) > limit
+            limit = 1e-9 * np.sqrt(P[:, i, i, None] * np.stack([P[:, k, k] for k in range(i)], axis=1))
+            bad = np.abs(lower - upper) > limit
         if bad.any():
             source, _, element = np.argwhere(bad)[0]
-            raise RuleError(f"covariance of {_place(source, element, batch)} is not symmetric")
+            raise RuleError(f"covariance of {_place(source, start + element, batch)} is not symmetric")
 
 
-def _complaint(means: FloatArray, covariances: FloatArray, fused: Fused, batch: tuple[int, ...]) -> str:
+def _complaint(means: FloatArray, covariances: FloatArray, result: Result, start: int, batch: tuple[int, ...]) -> str:
     """Why an element came back as NaN."""
     definite: NDArray[np.bool_] = linalg.is_positive_definite(covariances.transpose(1, 2, 0, 3))
-    for name, bad in (
+    for problem, bad in (
         ("mean of {} is not finite", ~np.isfinite(means).all(axis=1)),
         ("covariance of {} is not finite", ~np.isfinite(covariances).all(axis=(1, 2))),
         ("covariance of {} is not positive definite", ~definite),
     ):
         if bad.any():
-            source, at = np.argwhere(bad)[0]
-            return name.format(_place(source, at, batch))
-    element = int(np.flatnonzero(~np.isfinite(fused.covariance[0, 0]))[0])
-    where = f"batch element {tuple(int(i) for i in np.unravel_index(element, batch))}" if batch else "the input"
+            source, element = np.argwhere(bad)[0]
+            return problem.format(_place(source, start + element, batch))
+    element = np.flatnonzero(~np.isfinite(result.covariance[0, 0] + result.mean[0]))[0]
+    where = f"batch element {_index(start + element, batch)}" if batch else "the input"
     return f"{where} is too ill-conditioned to fuse to within 1e-6"
 
 
+def _index(element: int, batch: tuple[int, ...]) -> tuple[int, ...]:
+    return tuple(int(i) for i in np.unravel_index(element, batch))
+
+
 def _place(source: int, element: int, batch: tuple[int, ...]) -> str:
-    at = f" of batch element {tuple(int(i) for i in np.unravel_index(element, batch))}" if batch else ""
-    return f"source {int(source)}{at}"
+    return f"source {source}" + (f" of batch element {_index(element, batch)}" if batch else "")

@@ -52,7 +52,9 @@ def hmd_ga(sources: Sources, weights: FloatArray | None, influence: bool, *, cri
     if weights is not None:
         v = _normalised(np.log(weights) + log_z)
     elif sources.count == 2 and sources.fast and len(sources.means) <= pairs.LIMIT:
-        t = pairs.best_weight(criterion, mixture.C[:, :, 1], mixture.C[:, :, 0], bump=mixture.c[:, 1] - mixture.c[:, 0])
+        P, A, dets = sources.covariances, sources.information, sources.dets
+        ends = (P[:, :, 0], P[:, :, 1]), (A[:, :, 0], A[:, :, 1]), (dets[0], dets[1])
+        t = pairs.best_weight(criterion, *ends, bump=sources.spread[:, 1])
         v = np.stack([t, 1.0 - t])
     else:
         v = simplex.best_weights(criterion, mixture, sources.uniform)

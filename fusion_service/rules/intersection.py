@@ -56,7 +56,9 @@ def _intersection(sources: Sources, weights: FloatArray | None, influence: bool,
     optimise = weights is None and rho > 0.0 and sources.count > 1
     w = sources.uniform if weights is None else weights
     if optimise and sources.count == 2 and sources.fast and len(sources.means) <= pairs.LIMIT:
-        t = pairs.best_weight(criterion, model.A[:, :, 1], model.A[:, :, 0], rho=rho)
+        A, P, dets = model.A, sources.covariances, 1.0 / sources.dets
+        ends = (A[:, :, 1], A[:, :, 0]), (P[:, :, 1], P[:, :, 0]), (dets[1], dets[0])
+        t = pairs.best_weight(criterion, *ends, rho=rho)
         w = np.stack([t, 1.0 - t])
     elif optimise:
         w = simplex.best_weights(criterion, model, w)

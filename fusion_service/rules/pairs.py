@@ -23,38 +23,38 @@ FLAT = 1e-10
 """Relative slope below which a criterion does not care: the weight stays at a half."""
 
 
+Ends = tuple[FloatArray, FloatArray]
+
+
 def best_weight(
-    criterion: str,
-    M0: FloatArray,
-    M1: FloatArray,
-    *,
-    bump: FloatArray | None = None,
-    rho: float = 1.0,
+    criterion: str, M: Ends, inverses: Ends, dets: Ends, *, bump: FloatArray | None = None, rho: float = 1.0
 ) -> FloatArray:
     """The t (B,) in [0, 1] with the largest det M(t), or the smallest trace M(t)^-1.
 
     M(t) = (1-t) M0 + t M1 + t(1-t) bump bump', with bump (n, B) or None; or, for rho < 1,
-    M(t) = c(1-t) M0 + c(t) M1 with c(w) = w / ((1-rho) w + rho).
+    M(t) = c(1-t) M0 + c(t) M1 with c(w) = w / ((1-rho) w + rho). `M` is (M0, M1), each (n, n, B);
+    `inverses` and `dets` are theirs.
     """
-    n, size = M0.shape[0], M0.shape[-1]
+    n, size = M[0].shape[0], M[0].shape[-1]
     degree = n + (bump is not None)
     nodes, to_coefficients = _nodes(degree)
-    t = nodes[:, None]
-    M = np.empty((n, n, degree + 1, size))
-    difference = M1 - M0
+    det, adjugate = np.empty((2, degree + 1, 1, size))
+    det[0, 0], det[-1, 0] = dets
+    t = nodes[1:-1, None]
+    between = np.empty((n, n, degree - 1, size))
+    difference = M[1] - M[0]
     for i in range(n):
-        M[i, : i + 1] = M0[i, : i + 1, None] + t * difference[i, : i + 1, None]
+        between[i, : i + 1] = t * difference[i, : i + 1, None]
+        between[i, : i + 1] += M[0][i, : i + 1, None]
         if bump is not None:
-            M[i, : i + 1] += (t * (1.0 - t)) * (bump[: i + 1] * bump[i])[:, None]
+            between[i, : i + 1] += (t * (1.0 - t)) * (bump[: i + 1] * bump[i])[:, None]
     if criterion == "det":
-        values = linalg.det(M)[:, None]
-    else:
-        inverse, det, _ = linalg.sweep(M)
-        values = np.stack([det, det * linalg.trace(inverse)], axis=1)
-    # (degree + 1, 1 or 2, B): the coefficients of det M, and of trace adj M
-    coefficients = linalg.total(to_coefficients.T[:, :, None, None] * values[:, None])
-    slope = _det_slope if criterion == "det" else _trace_slope
-    return _newton(lambda t, c: slope(t, c, n, rho), coefficients)
+        det[1:-1, 0] = linalg.det(between)
+        return _newton(_det_slope, to_coefficients, det, n, rho)
+    inverse, det[1:-1, 0], _ = linalg.sweep(between)
+    adjugate[1:-1, 0] = linalg.trace(inverse)
+    adjugate[0, 0], adjugate[-1, 0] = linalg.trace(inverses[0]), linalg.trace(inverses[1])
+    return _newton(_trace_slope, to_coefficients, np.concatenate([det, adjugate * det], axis=1), n, rho)
 
 
 @cache
@@ -65,16 +65,23 @@ def _nodes(degree: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _polynomials(t: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Values, first and second derivatives by t, each like t, of polynomials c (degree + 1, B) in 2t - 1."""
+    """Values, first and second derivatives by t of polynomials c (degree + 1, k, B) in 2t - 1: (k, B) each."""
     z = t + t - 1.0
-    f: FloatArray = c[-1] * z + c[-2]
-    df: FloatArray = c[-1].copy()
+    f = c[-1] * z
+    f += c[-2]
+    df: FloatArray = np.zeros_like(f)
+    df += c[-1]
     ddf: FloatArray = np.zeros_like(f)
-    for row in c[-3::-1]:
-        ddf = ddf * z + df
-        df = df * z + f
-        f = f * z + row
-    return f, 2.0 * df, 8.0 * ddf
+    for k in range(len(c) - 3, -1, -1):
+        ddf *= z
+        ddf += df
+        df *= z
+        df += f
+        f *= z
+        f += c[k]
+    df *= 2.0
+    ddf *= 8.0
+    return f, df, ddf
 
 
 def _share(t: FloatArray, rho: float) -> tuple[FloatArray, ...]:
@@ -94,11 +101,11 @@ def _share(t: FloatArray, rho: float) -> tuple[FloatArray, ...]:
 def _det_slope(t: FloatArray, c: FloatArray, n: int, rho: float) -> tuple[FloatArray, FloatArray]:
     """First and second derivative of log det M."""
     if rho == 1.0:
-        f, df, ddf = _polynomials(t, c[:, 0])
+        (f,), (df,), (ddf,) = _polynomials(t, c)
         first = df / f
         return first, ddf / f - first * first
     s, ds, dds, r, dr, ddr = _share(t, rho)
-    f, df, ddf = _polynomials(r, c[:, 0])
+    (f,), (df,), (ddf,) = _polynomials(r, c)
     u, v = df / f, ds / s
     return u * dr + n * v, (ddf / f - u * u) * dr * dr + u * ddr + n * (dds / s - v * v)
 
@@ -116,44 +123,53 @@ def _trace_slope(t: FloatArray, c: FloatArray, n: int, rho: float) -> tuple[Floa
 
 def _log_ratio(t: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
     """g'/g and g''/g of g = trace adj M / det M."""
-    f, df, ddf = _polynomials(t, c[:, 0])
-    a, da, dda = _polynomials(t, c[:, 1])
+    (f, a), (df, da), (ddf, dda) = _polynomials(t, c)
     u, v = da / a, df / f
     first = u - v
     return first, dda / a - 2.0 * first * v - ddf / f
 
 
-Slope = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+Slope = Callable[[FloatArray, FloatArray, int, float], tuple[FloatArray, FloatArray]]
 
 
-def _newton(slope: Slope, coefficients: FloatArray) -> FloatArray:
-    """Where in [0, 1] a falling function passes zero; the better end if nowhere, a half if it is flat."""
-    size = coefficients.shape[-1]
-    at_zero, _ = slope(np.zeros(size), coefficients)
-    at_one, _ = slope(np.ones(size), coefficients)
+def _newton(slope: Slope, to_coefficients: FloatArray, values: FloatArray, n: int, rho: float) -> FloatArray:
+    """Where in [0, 1] a falling slope passes zero; the better end if nowhere, a half if it is flat.
+
+    `values` (degree + 1, k, B): of the polynomials at the nodes.
+    """
+    c = to_coefficients[:, 0, None, None] * values[0]
+    for column, row in zip(to_coefficients.T[1:], values[1:], strict=True):
+        c += column[:, None, None] * row
+    size = c.shape[-1]
+    ends = np.zeros((2, size))
+    ends[1] = 1.0
+    (at_zero, at_one), _ = slope(ends, c[:, :, None], n, rho)
     out = np.full(size, 0.5)
     steep = (at_zero > FLAT) | (at_one < -FLAT)
     out[steep & (at_zero <= 0.0)] = 0.0
     out[steep & (at_one >= 0.0)] = 1.0
     todo = np.flatnonzero(steep & (at_zero > 0.0) & (at_one < 0.0))
+    if len(todo) < size:
+        c = c[..., todo]
     t, lo, hi = out[todo], np.zeros(len(todo)), np.ones(len(todo))
-    c = coefficients[..., todo] if len(todo) < size else coefficients
     for _ in range(ROUNDS):
         if not len(todo):
             break
-        h, dh = slope(t, c)
+        h, dh = slope(t, c, n, rho)
         rising = h > 0.0
-        np.copyto(lo, t, where=rising)
-        np.copyto(hi, t, where=~rising)
+        lo = np.where(rising, t, lo)
+        hi = np.where(rising, hi, t)
         step = h / dh
         new = t - step
-        inside = (new > lo) & (new < hi)
-        new = np.where(inside, new, 0.5 * (lo + hi))
+        outside = ~((new >= lo) & (new <= hi))
+        if outside.any():
+            np.copyto(new, 0.5 * (lo + hi), where=outside)
         out[todo] = new
-        # the first-order gain still to be had is |h step|
-        busy = ~(inside & (np.abs(h * step) < 1e-14)) & (hi - lo > 1e-16)
+        gain = h * step  # minus the squared Newton decrement; after this step about its square remains
+        busy = ((gain < -1e-11) | (gain > 0.0) | outside) & (hi - lo > 1e-16)
         if busy.all():
             t = new
         else:
-            todo, t, lo, hi, c = todo[busy], new[busy], lo[busy], hi[busy], c[..., busy]
+            left = np.flatnonzero(busy)
+            todo, t, lo, hi, c = todo[left], new[left], lo[left], hi[left], c[..., left]
     return out

@@ -26,8 +26,8 @@ class Sources:
         """From the layout of `fuse_last`: means (N, n, B), covariances (N, n, n, B)."""
         P = covariances.transpose(1, 2, 0, 3)
         A, dets, margin = linalg.sweep(P)
-        worst = condition(P, A).max(axis=0)
-        return cls(means.transpose(1, 0, 2), P, A, dets, worst, np.all(margin > 1e-14, axis=0, keepdims=True)[0])
+        worst, least = condition(P, A).max(axis=0), margin.min(axis=0)
+        return cls(means.transpose(1, 0, 2), P, A, dets, worst, least > 1e-14)
 
     @property
     def count(self) -> int:
@@ -79,14 +79,17 @@ def weighted_product(sources: Sources, scale: FloatArray | None) -> tuple[FloatA
 
     `scale` (N, B), or None for ones.
     """
-    A, x = sources.information, sources.spread
-    if scale is not None:
-        A = A * scale
-    M = A[:, :, 0].copy()
-    y = np.zeros_like(x[:, 0])
-    for i in range(1, sources.count):
-        M += A[:, :, i]
-        y += linalg.matvec(A[:, :, i], x[:, i])
+    x = sources.spread
+    A = sources.information
+    M, y = np.empty_like(A[:, :, 0]), np.zeros_like(x[:, 0])
+    for k in range(len(M)):  # of M the lower triangle is read
+        terms = A[k, : k + 1] if scale is None else A[k, : k + 1] * scale
+        M[k, : k + 1] = terms[:, 0]
+        for i in range(1, sources.count):
+            M[k, : k + 1] += terms[:, i]
+    for i in range(1, sources.count):  # x[:, 0] is zero
+        term = linalg.matvec(A[:, :, i], x[:, i])
+        y += term if scale is None else term * scale[i]
     P = linalg.inverse(M)
     mean = sources.means[:, 0] + linalg.matvec(P, y)
     return mean, P, np.maximum(sources.condition, condition(M, P))

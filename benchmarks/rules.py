@@ -1,0 +1,131 @@
+"""How fast the fusion rules are: `python -m benchmarks.rules [--quick]`.
+
+Public layout in and out, one thread, its CPU time. Each rule is timed in turn with two yardsticks, and the
+best of several rounds of each is compared, since a shared machine drifts by more than the rules differ:
+
+  (a) the same B fusions by the naive rule with stacked `np.linalg.inv`,
+  (b) a loop over fusions that finds the weights with `scipy.optimize` (some of them, scaled up).
+
+`/(a)` is time over (a)'s: smaller is better. `x(b)` is how many times faster than (b): larger is better.
+"""
+
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize, minimize_scalar
+
+from fusion_service.rules import fuse
+
+Array = NDArray[np.float64]
+Case = tuple[str, dict[str, Any]]
+
+CASES: tuple[Case, ...] = (
+    ("naive", {}),
+    ("ci", {"weights": "uniform"}),
+    ("ci", {"criterion": "det"}),
+    ("ci", {"criterion": "trace"}),
+    ("bci", {"criterion": "det", "max_correlation": 0.5}),
+    ("bci", {"criterion": "trace", "max_correlation": 0.5}),
+    ("hmd-ga", {"criterion": "det"}),
+    ("hmd-ga", {"criterion": "trace"}),
+)
+
+
+def estimates(rng: np.random.Generator, B: int, N: int, n: int) -> tuple[Array, Array]:
+    """Random estimates: standard deviations over two decades, means a few of them apart."""
+    q, _ = np.linalg.qr(rng.normal(size=(B, N, n, n)))
+    P = (q * 10.0 ** rng.uniform(-1, 1, size=(B, N, 1, n))) @ q.swapaxes(-1, -2)
+    return rng.normal(size=(B, N, n)), 0.5 * (P + P.swapaxes(-1, -2))
+
+
+def stacked(x: Array, P: Array) -> tuple[Array, Array]:
+    """Yardstick (a)."""
+    A = np.linalg.inv(P)
+    fused = np.linalg.inv(A.sum(axis=1))
+    return (fused @ (A @ x[..., None]).sum(axis=1))[..., 0], fused
+
+
+def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
+    """Yardstick (b): what a script would do."""
+    _, N, _ = x.shape
+    criterion, rho = options["criterion"], options.get("max_correlation", 1.0)
+    for means, covariances in zip(x, P, strict=True):
+        A = np.linalg.inv(covariances)
+        if rule == "hmd-ga":
+            total, y = A.sum(axis=0), np.einsum("ijk,ik->ij", A, means)
+            C = np.linalg.inv(total - A)
+            c = np.einsum("ijk,ik->ij", C, y.sum(axis=0) - y)
+
+        def information(w: Array) -> Array:
+            if rule == "hmd-ga":
+                r = c - w @ c  # noqa: B023
+                return np.asarray(np.einsum("i,ijk->jk", w, C) + (r.T * w) @ r)  # noqa: B023
+            return np.asarray(np.einsum("i,ijk->jk", w / ((1 - rho) * w + rho), A))  # noqa: B023
+
+        def cost(w: Array) -> float:
+            M = information(w)
+            return float(-np.linalg.det(M) if criterion == "det" else np.trace(np.linalg.inv(M)))
+
+        if N == 2:
+            minimize_scalar(lambda t: cost(np.array([t, 1 - t])), bounds=(0, 1), method="bounded")
+        else:
+            minimize(
+                cost,
+                np.full(N, 1 / N),
+                bounds=[(0, 1)] * N,
+                constraints={"type": "eq", "fun": lambda w: w.sum() - 1},
+                method="SLSQP",
+            )
+
+
+def clock(run: Callable[[], object]) -> float:
+    start = time.thread_time()
+    run()
+    return time.thread_time() - start
+
+
+def measure(x: Array, P: Array, rounds: int) -> Iterator[tuple[str, float, float, float]]:
+    """For each case: its name, seconds per batch, ratio to (a), speed-up over (b) (NaN: no weights)."""
+    B, N, _ = x.shape
+    some = max(1, min(B, 60 // N))
+    for rule, options in CASES:
+        ours: list[float] = []
+        a: list[float] = []
+        b: list[float] = []
+        for _ in range(rounds):
+            ours.append(clock(lambda: fuse(rule, x, P, **options)))  # noqa: B023
+            a.append(clock(lambda: stacked(x, P)))
+            if "criterion" in options and len(b) < 3:
+                b.append(clock(lambda: one_by_one(x[:some], P[:some], rule, options)) * B / some)  # noqa: B023
+        name = " ".join((rule, *(str(v) for v in options.values())))
+        yield name, min(ours), min(ours) / min(a), min(b) / min(ours) if b else np.nan
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Speed of the fusion rules", epilog="python -m benchmarks.rules")
+    parser.add_argument("--quick", action="store_true", help="n = 4 and N = 2 only")
+    quick = parser.parse_args().quick
+    rng = np.random.default_rng(1)
+    sizes = [(4, 2, B) for B in (1, 20, 1000, 10_000)]
+    if not quick:
+        sizes += [(n, 2, B) for n in (2, 6) for B in (1, 20, 1000, 10_000)]
+        sizes += [(4, N, B) for N in (3, 5, 20) for B in (1, 1000)]
+    print(f"{'n':>2} {'N':>3} {'B':>6}  {'rule':<20} {'us/fusion':>10} {'/(a)':>7} {'x(b)':>7}")
+    for n, N, B in sizes:
+        x, P = estimates(rng, B, N, n)
+        rounds = 30 if B * N <= 2000 else 15
+        for name, seconds, over_a, times_b in measure(x, P, 3 if N > 5 else rounds):
+            b = "" if np.isnan(times_b) else f"{times_b:7.0f}"
+            print(f"{n:>2} {N:>3} {B:>6}  {name:<20} {1e6 * seconds / B:10.2f} {over_a:7.2f} {b}", flush=True)
+
+
+if __name__ == "__main__":
+    main()
