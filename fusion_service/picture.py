@@ -53,9 +53,9 @@ def mission_map(
     """Draw a mission's messages, in any order, to the PNG file `path`; return it.
 
     frame: to draw in, by default that of the fused tracks (else of local ones, of truth, of a sensor); for ECEF, ENU
-    about a place. ellipses: about how many for each fused track over the mission. Tentative fused
-    tracks are not drawn. A source whose frame has no relation to the map's is named in the legend. Raises ValueError if
-    there is nothing to draw, ImportError without matplotlib.
+    about a place. ellipses: about how many for each fused track over the mission. Tentative fused tracks are not
+    drawn. A sensor stands where its newest info says. A source whose frame has no relation to the map's is named in
+    the legend. Raises ValueError if there is nothing to draw, ImportError without matplotlib.
     """
     from matplotlib.figure import Figure
 
@@ -69,6 +69,7 @@ def mission_map(
     axes = figure.add_subplot(grid[:, 0])
     for name, info in mission.infos.items():
         _draw_sensor(axes, name, info, mission, metres)
+    _name_sensors(axes, mission, metres, float(max(high - low)))
     _draw_tracks(axes, mission, metres, _spread_out(mission.fused, ellipses), scale)
     for target, (_, xy) in mission.truth.items() if len(mission.truth) <= MAX_LABELS else ():
         axes.annotate(str(target), xy[0] / metres, (4, 4), textcoords="offset points", size=8, color="#555555")
@@ -124,7 +125,8 @@ def _gather(messages: Iterable[Message], frame: Frame | None) -> _Mission:
         elif isinstance(message, Truth):
             truths.append(message)
         elif isinstance(message, SensorInfo):
-            infos[message.source] = message
+            known = infos.get(message.source, message)
+            infos[message.source] = max(known, message, key=lambda info: (info.epoch, info.seq))
     located: list[LocalTracks | GlobalTracks | Truth | SensorInfo] = [
         *pictures,
         *(scan for scans in local.values() for scan in scans),
@@ -245,9 +247,21 @@ def _draw_sensor(axes: Axes, name: str, info: SensorInfo, mission: _Mission, met
         axes.plot(*edge.T, "--", color=colour, lw=1.0, alpha=0.8, zorder=1)
         axes.fill(*edge.T, color=colour if index == 0 else "none", alpha=0.04, lw=0, zorder=0)
     axes.plot(*place, "^", color=colour, ms=10, mec="black", mew=0.8, zorder=6)
-    axes.annotate(
-        name, place, (0, -15), textcoords="offset points", ha="center", size=9, zorder=6, annotation_clip=True
-    )
+
+
+def _name_sensors(axes: Axes, mission: _Mission, metres: float, width: float) -> None:
+    """The names of sensors that stand together, within a hundredth of the map's width, on one line."""
+    together: list[tuple[Floats, list[str]]] = []
+    for name, (place,) in mission.sensors.items():
+        near = (names for at, names in together if math.dist(at, place) < width / 100)
+        names = next(near, None)
+        if names is None:
+            together.append((place, [name]))
+        else:
+            names.append(name)
+    for at, names in together:
+        where = (at[0] / metres, at[1] / metres)
+        axes.annotate(", ".join(names), where, (0, -15), textcoords="offset points", ha="center", size=9, zorder=6)
 
 
 def _draw_tracks(axes: Axes, mission: _Mission, metres: float, when: set[int] | None, scale: float) -> None:

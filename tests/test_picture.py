@@ -81,7 +81,7 @@ def test_a_map_shows_truth_sources_and_fused_tracks(tmp_path: Path) -> None:
 
 
 def test_the_order_of_messages_does_not_matter(tmp_path: Path) -> None:
-    mission = harbour()
+    mission = [*harbour(), info("radar", position=(40.0, 0.0, 0.0), epoch=2)]
     there, back = mission_map(mission, tmp_path / "a.png"), mission_map(mission[::-1], tmp_path / "b.png")
     assert there.read_bytes() == back.read_bytes()
 
