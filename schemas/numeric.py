@@ -77,7 +77,7 @@ def _sound(means: Floats, covariances: Floats) -> NDArray[np.bool_]:
     """True where numbers are in range and every pivot is large enough; NaN and infinity fail each comparison."""
     n = means.shape[1]
     good: NDArray[np.bool_] = np.all(np.abs(means.T) <= MAX_MEAN, axis=0)
-    rest = np.ascontiguousarray(covariances.reshape(len(means), n * n).T).reshape(n, n, -1)
+    rest = covariances.reshape(len(means), n * n).T.copy().reshape(n, n, -1)
     for k in range(n):
         variance = covariances[:, k, k]
         pivot = rest[k, k]

@@ -119,6 +119,15 @@ def test_not_finite_anywhere_spoils_its_track_only(value: float) -> None:
 )
 def test_covariances(matrix: NDArray[np.float64], fault: str) -> None:
     assert faults(with_matrix(tracks(4), 1, matrix)) == [["", fault, "", "", ""]]
+    assert faults(with_matrix(tracks(4, 1), 0, matrix)) == [[fault]]
+
+
+@pytest.mark.parametrize(("pivot", "fault"), [(5e-14, ""), (5e-15, "not-positive-definite")])
+def test_smallest_pivot(pivot: float, fault: str) -> None:
+    """Two components of equal variance with correlation r: the second pivot is 1 - r^2 of it."""
+    correlation = np.sqrt(1 - pivot)
+    matrix = 1e6 * np.array([[1.0, correlation], [correlation, 1.0]])
+    assert faults(with_matrix(tracks(12, 2, 2), 1, matrix)) == [["", fault]]
 
 
 def test_means_out_of_range() -> None:
@@ -242,3 +251,19 @@ def test_a_message_has_the_same_faults_alone_and_among_others() -> None:
     assert faults(*messages) == alone
     assert faults(*messages[::-1]) == alone[::-1]
     assert faults(messages[7], messages[7]) == [alone[7]] * 2
+
+
+@pytest.mark.parametrize("block", [1, 2, 3, 100])
+def test_blocks_do_not_show(block: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    messages = [broken(seed) for seed in range(50)]
+    whole = faults(*messages)
+    monkeypatch.setattr("schemas.numeric.BLOCK", block)
+    assert faults(*messages) == whole
+
+
+def test_messages_are_left_as_they_are() -> None:
+    for message in (tracks(13, 1), tracks(13, 1, 2), broken(14)):
+        before = message.means.copy(), message.covariances.copy()
+        schemas.check_numbers([message])
+        assert np.array_equal(message.means, before[0], equal_nan=True)
+        assert np.array_equal(message.covariances, before[1], equal_nan=True)
