@@ -1,0 +1,80 @@
+"""A step of the centre beside its parts, side by side in one run: `python -m benchmarks.centre`.
+
+T targets seen by three sources each, links standing, det-CI. The ratio is to the time of the bare fusion of the
+same T x 3 tracks by `fuse_last`; "first" is the step that links everything from nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+import schemas
+from fusion_service.centre import FusionCentre
+from fusion_service.rules import fuse_last
+
+SECOND = 10**9
+SPACE = ("x", "y", "vx", "vy")
+FRAME = schemas.Enu(59.0, -55.0)
+SIGMA = np.array([30.0, 30.0, 2.0, 2.0])
+
+
+def messages(states: np.ndarray, second: int, rng: np.random.Generator) -> list[schemas.LocalTracks]:
+    now = states.copy()
+    now[:, :2] += second * states[:, 2:]
+    return [
+        schemas.LocalTracks(
+            source=source, epoch=1, seq=second, sent=0, time=second * SECOND, complete=True, space=SPACE, frame=FRAME,
+            ids=np.arange(1, len(states) + 1, dtype=np.uint64),
+            means=now + rng.normal(size=now.shape) * SIGMA,
+            covariances=np.tile(np.diag(SIGMA**2), (len(states), 1, 1)),
+        )
+        for source in ("r1", "r2", "r3")
+    ]  # fmt: skip
+
+
+def best(call: Callable[[], object], repeat: int = 5) -> float:
+    times = []
+    for _ in range(repeat):
+        begin = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def run(targets: int) -> str:
+    rng = np.random.default_rng(1)
+    side = 2000.0 * np.sqrt(targets)
+    states = np.concatenate([rng.uniform(-side, side, (targets, 2)), rng.normal(0, 50, (targets, 2))], axis=1)
+    centre = FusionCentre({})
+    steps = []
+    for second in range(1, 8):
+        batch = messages(states, second, rng)
+        for message in batch:
+            centre.handle(message, 10**18)
+        begin = time.perf_counter()
+        centre.step(second * SECOND)
+        steps.append(time.perf_counter() - begin)
+    means = np.ascontiguousarray(np.stack([m.means.T for m in batch]))
+    covariances = np.ascontiguousarray(np.stack([np.moveaxis(m.covariances, 0, 2) for m in batch]))
+    fusing = best(lambda: fuse_last("ci", means, covariances, criterion="det", influence=True))
+    data = [schemas.encode(message) for message in batch]
+    reading = best(lambda: schemas.check_numbers([schemas.decode(one) for one in data]))  # type: ignore[misc]
+    saving = best(centre.checkpoint)
+    step = min(steps[1:])
+    return (
+        f"{targets:7d} {1e3 * steps[0]:10.2f} {1e3 * step:10.2f} {step / fusing:12.1f} "
+        f"{1e3 * reading:12.2f} {1e3 * saving:12.2f} {1e6 * step / targets:14.1f}"
+    )
+
+
+def main() -> None:
+    print("targets   first ms    step ms  step/fusion   reading ms    saving ms  us per target")
+    for targets in (20, 200, 1000, 5000):
+        print(run(targets), flush=True)
+
+
+if __name__ == "__main__":
+    main()
