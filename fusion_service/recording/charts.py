@@ -1,7 +1,7 @@
 """Time series beside the picture: errors, NEES, counts and influence.
 
-/error/{centre}/target {id}           distance to the track assigned to each true object, m
-/nees/{centre}/target {id}            NEES of the position / dimension, with .../bounds/low and high
+/error/{centre}/{target}              distance to the track assigned to each true object, m
+/nees/{centre}/{target}               NEES of the position / dimension, with .../bounds/low and high
 /anees/{centre}/mean                  its mean over the targets, with bounds for their number
 /counts/local/{source}  /counts/{centre}/{status}  /influence/{centre}/{source}
 """
@@ -52,8 +52,8 @@ class Charts:
         for target, error, nees in zip(score.ids.tolist(), score.error.tolist(), score.nees.tolist(), strict=True):
             tone = palette.series_colour(self._targets.setdefault(target, len(self._targets)))
             name = f"target {target}"
-            self._add(entity("error", centre, name), stamp, error, tone, name)
-            self._add(entity("nees", centre, name), stamp, nees, tone, name)
+            self._add(entity("error", centre, str(target)), stamp, error, tone, name)
+            self._add(entity("nees", centre, str(target)), stamp, nees, tone, name)
         single = metrics.nees_bounds(score.dimension, 1)
         for chart, (low, high) in (("nees", single), ("anees", score.bounds)):
             for name, value in (("low", low), ("high", high)):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy
-from schemas import Coverage, Disk, Ecef, Enu, Frame, Height, LocalIntensity, Polygon, Sector, SensorInfo
+from schemas import Disk, Ecef, Enu, Frame, Height, LocalIntensity, Polygon, Sector, SensorInfo
 from schemas.messages import GlobalTracks, LocalTracks
 
 __all__ = ["Chart", "Outline", "Place", "ellipses", "grid", "moments", "outline"]
@@ -117,17 +117,18 @@ def ellipses(place: Place, dashed: NDArray[np.bool_]) -> Outline:
 def outline(info: SensorInfo) -> tuple[list[Floats], Frame]:
     """The edges of a sensor's field of view as (P, 2) strips of x, y in m, and the frame they are in."""
     frame, centre = info.frame, np.array(info.position[:2])
-    if isinstance(frame, Ecef) and not isinstance(info.coverage, Polygon):
+    if isinstance(info.coverage, Polygon):
+        return [np.array([*info.coverage.points, info.coverage.points[0]])], frame
+    if isinstance(frame, Ecef):
         lat, lon, alt = geodesy.ecef_to_geodetic(*info.position)
         frame, centre = Enu(float(lat), float(lon), float(alt)), np.zeros(2)
     return [centre + edge for edge in _edges(info.coverage)], frame
 
 
-def _edges(coverage: Coverage | None) -> list[Floats]:
+def _edges(coverage: Disk | Sector | None) -> list[Floats]:
+    """As seen from the sensor."""
     if coverage is None:
         return []
-    if isinstance(coverage, Polygon):
-        return [np.array([*coverage.points, coverage.points[0]])]
     if isinstance(coverage, Disk) or coverage.width >= 2 * math.pi:
         return [_arc(radius, 0.0, 2 * math.pi) for radius in (coverage.radius, coverage.inner) if radius > 0]
     return [_sector(coverage)]

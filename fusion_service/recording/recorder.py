@@ -74,6 +74,8 @@ FLUSH = 2.0
 POLL = 0.1
 """Seconds after which a set `stop` is seen."""
 
+Item = tuple[str, bytes | bool | int, int]
+"""Key; bytes of a message, whether a token is there, or how many messages are lost; receive time, ns."""
 Drawable = LocalTracks | LocalIntensity | GlobalTracks | SensorInfo | Truth
 
 
@@ -247,7 +249,11 @@ class Recorder:
         tracks = [message for message, _ in drawn if isinstance(message, LocalTracks | LocalIntensity | GlobalTracks)]
         faults = dict(zip(map(id, tracks), check_numbers(tracks), strict=True))
         for message, stamp in drawn:
-            stamp = stamp if stamp.time is not None else stamp._replace(time=self._now)
+            if stamp.time is None:
+                stamp = stamp._replace(time=self._now)
+                if hasattr(message, "time"):
+                    self._not_drawn(message.source, "its time is far ahead", 1, stamp)
+                    continue
             fault = faults.get(id(message), np.zeros(0, dtype=np.uint8))
             for code in np.unique(fault[fault != 0]).tolist():
                 self._not_drawn(message.source, FAULTS[code], int((fault == code).sum()), stamp)
@@ -330,40 +336,51 @@ def run_recorder(
     """Record all that crosses `bus` under `realm` until `stop` is set, and close the file. Returns the recorder.
 
     path: None for `default_path()`. interval: seconds between ticks; a recorder that is killed loses at most what
-    came since the last. on_tick: called after each. The rest as in `Recorder`.
+    came since the last. on_tick: called after each. The rest, and what is raised, as in `Recorder`; the file is made
+    when the subscription stands.
     """
-    inbox: Inbox[tuple[str, bytes | bool | int, int]] = Inbox(CAPACITY)
+    inbox: Inbox[Item] = Inbox(CAPACITY)
 
     def put(key: str, said: bytes | bool | int) -> None:
         inbox.put(key, (key, said, time.time_ns()), len(said) if isinstance(said, bytes) else 0)
 
-    with Recorder(path or default_path(), realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw) as recorder:
-        declared = [
-            bus.watch(f"{realm}/v1/*/*/alive", put),
-            bus.subscribe(f"{realm}/v1/**", put, on_miss=put),
-        ]
-        log.info("recording %s/v1/** into %s", realm, recorder.path)
-        due = time.monotonic() + interval
-        dropped: Counter[str] = Counter()
-        while not stop.is_set():
-            _take(inbox, recorder, min(max(due - time.monotonic(), 0.0), POLL))
-            if time.monotonic() >= due:
-                due = time.monotonic() + interval
-                now_dropped = Counter(inbox.dropped)
-                for key, count in (now_dropped - dropped).items():
-                    recorder.lost(key, count, time.time_ns())
-                dropped = now_dropped
-                recorder.tick()
-                if on_tick:
-                    on_tick(recorder)
+    declared = [
+        bus.watch(f"{realm}/v1/*/*/alive", put),
+        bus.subscribe(f"{realm}/v1/**", put, on_miss=put),
+    ]
+    try:
+        path = path or default_path()
+        with Recorder(path, realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw) as recorder:
+            log.info("recording %s/v1/** into %s", realm, path)
+            _loop(inbox, recorder, stop, interval, on_tick or (lambda recorder: None))
+            for declaration in declared:
+                declaration.close()
+            _take(inbox, recorder, 0.0)
+    finally:
         for declaration in declared:
             declaration.close()
-        _take(inbox, recorder, 0.0)
-    log.info("%s: %d messages, %d rows", recorder.path, recorder.messages, recorder.rows)
+    log.info("%s: %d messages, %d rows", path, recorder.messages, recorder.rows)
     return recorder
 
 
-def _take(inbox: Inbox[tuple[str, bytes | bool | int, int]], recorder: Recorder, timeout: float) -> None:
+def _loop(
+    inbox: Inbox[Item], recorder: Recorder, stop: threading.Event, interval: float, on_tick: Callable[[Recorder], None]
+) -> None:
+    due = time.monotonic() + interval
+    dropped: Counter[str] = Counter()
+    while not stop.is_set():
+        _take(inbox, recorder, min(max(due - time.monotonic(), 0.0), POLL))
+        if time.monotonic() < due:
+            continue
+        due = time.monotonic() + interval
+        before, dropped = dropped, Counter(inbox.dropped)
+        for key, count in (dropped - before).items():
+            recorder.lost(key, count, time.time_ns())
+        recorder.tick()
+        on_tick(recorder)
+
+
+def _take(inbox: Inbox[Item], recorder: Recorder, timeout: float) -> None:
     for _, (key, said, received) in inbox.take(timeout):
         if isinstance(said, bytes):
             recorder.handle(key, said, received)

@@ -36,7 +36,7 @@ from schemas import (
 START = 1_790_000_000 * 10**9
 SPACE = ("x", "vx", "y", "vy")
 CENTRE = Enu(59.0, 10.5)
-RADARS = {"radar1": Enu(59.00, 10.30), "radar2": Enu(58.93, 10.55), "radar3": Enu(59.08, 10.65)}
+RADARS = {"radar1": Enu(59.00, 10.30), "radar2": Enu(58.93, 10.55), "radar3": Enu(59.04, 10.52)}
 LOST = ("radar2", 60, 90)
 """A source that is silent between these steps."""
 TARGETS = 5

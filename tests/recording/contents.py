@@ -1,0 +1,38 @@
+"""What a recording holds, read with Rerun itself."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import Any
+
+from rerun.chunk import RrdReader
+
+
+def rows(path: Path, entity: str) -> list[dict[str, Any]]:
+    """The rows of `entity` that are not static, by mission time: "time" (ns), and each component's instances under
+    its full name, as in "Points2D:positions"."""
+    found: list[dict[str, Any]] = []
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RRD file has no footer")
+        reader = RrdReader(path)
+    for chunk in reader.stream().filter(content=entity):
+        if chunk.is_static:
+            continue
+        batch = chunk.to_record_batch()
+        names = batch.schema.names
+        times = batch.column("time").cast("int64").to_pylist() if "time" in names else [None] * batch.num_rows
+        columns = {name: batch.column(name).to_pylist() for name in names if ":" in name}
+        for index, time in enumerate(times):
+            found.append({"time": time} | {name: column[index] for name, column in columns.items()})
+    return sorted(found, key=lambda row: (row["time"] is None, row["time"]))
+
+
+def row(path: Path, entity: str, time: int) -> dict[str, Any]:
+    """The one row of `entity` at `time`."""
+    (found,) = (row for row in rows(path, entity) if row["time"] == time)
+    return found
+
+
+def entities(path: Path) -> set[str]:
+    return {chunk.entity_path for chunk in RrdReader(path).stream()}
