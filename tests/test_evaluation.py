@@ -138,12 +138,13 @@ def test_a_source_shows_a_track_until_it_is_stale_or_gone() -> None:
     open_scan = [tracks("a", 1, [5], STILL), tracks("a", 3, [], [], complete=False)]
     assert missed([info("a", 2.0), *mission, *open_scan]) == [0, *range(8, 13)], "older than three periods"
     assert missed([info("a", 2.0), *mission, *gone[::-1]]) == [0, *range(3, 13)], "whatever the order of arrival"
-    again = [tracks("a", 1, [5], STILL), tracks("a", 4, [6], [[500.0, 0.0]], epoch=2)]
+    again = [tracks("a", 1, [5], STILL), tracks("a", 4, [6], [[500.0, 0.0]], epoch=2, complete=False)]
     assert missed([info("a", 9.0), *mission, *again]) == [0, *range(4, 13)], "a new epoch drops the old tracks"
     late = [tracks("a", 2, [6], STILL, epoch=2), tracks("a", 4, [], [], epoch=1)]
     assert missed([info("a", 9.0), *mission, *late]) == [0, 1], "an old epoch says nothing any more"
-    bad = tracks("a", 1, [5], [[np.nan, 0.0]])
-    assert missed([info("a", 9.0), *mission, bad]) == list(range(13)), "not a number is not a track"
+    for bad in ({"means": np.full((1, 4), np.nan)}, {"covariances": -np.eye(4)[None]}):
+        unsound = tracks("a", 1, [5], STILL, **bad)
+        assert missed([info("a", 9.0), *mission, unsound]) == list(range(13)), "no numbers, no track"
     every_third = [tracks("a", t, [5], STILL) for t in (0, 3)]
     assert missed([*mission, *every_third]) == [], "without info: the median interval"
 

@@ -112,12 +112,13 @@ def test_with_z_covariances_against_monte_carlo() -> None:
 
 
 @pytest.mark.parametrize("height", [Height(), Height(3000.0), Height(-20.0)])
-def test_without_z_places_stay_on_the_height_surface(height: Height) -> None:
-    """pymap3d gives x, y in both frames of places on the surface, up to 300 km away."""
-    lat, lon = RNG.uniform(57.5, 62.5, 500), RNG.uniform(6.0, 11.5, 500)
+@pytest.mark.parametrize("far", [1.0, 8.0])
+def test_without_z_places_stay_on_the_height_surface(height: Height, far: float) -> None:
+    """pymap3d gives x, y in both frames of places on the surface, more than 300 km and 2,000 km away."""
+    lat, lon = 59.9 - far * RNG.uniform(-1, 2.5, 500), 10.7 + far * RNG.uniform(-5, 1, 500)
     at = np.full(500, height.value)
     e, n, _ = pymap3d.geodetic2enu(lat, lon, at, OSLO.lat, OSLO.lon, OSLO.alt)
-    assert 2.5e5 < np.hypot(e, n).max() < 4e5
+    assert np.hypot(e, n).max() > 3e5 * min(far, 7.0)
     means = np.stack([e, np.zeros(500), n, np.zeros(500)], axis=-1)
     moved, _ = transform(means, np.tile(np.eye(4), (500, 1, 1)), SPACE_2D, OSLO, BERGEN, height)
     want = pymap3d.geodetic2enu(lat, lon, at, BERGEN.lat, BERGEN.lon, BERGEN.alt)[:2]
@@ -148,6 +149,18 @@ def test_without_z_the_jacobian_is_the_derivative_of_the_map() -> None:
         full[np.ix_(range(50), pair, pair)] = J
     np.testing.assert_allclose(spread, full @ covs @ full.swapaxes(1, 2), rtol=1e-7, atol=1e-5)
     assert np.ptp(J[:, 0, 0]) > 1e-3, "the places should be far enough apart for J to differ"
+
+
+def test_without_z_the_height_counts_by_its_derivative() -> None:
+    """sigma adds g g' to the position, g the central difference by the height; far away, where g has 4 figures."""
+    mean, cov, sigma = np.array([[9e5, 0.0, -7e5, 0.0]]), np.eye(4)[None], 30.0
+    moved = [transform(mean, cov, SPACE_2D, OSLO, BERGEN, Height(1000.0 + h))[0][0, [0, 2]] for h in (-50.0, 50.0)]
+    g = sigma * (moved[1] - moved[0]) / 100.0
+    spreads = [transform(mean, cov, SPACE_2D, OSLO, BERGEN, Height(1000.0, s))[1][0] for s in (sigma, 0.0)]
+    added = np.zeros((4, 4))
+    added[::2, ::2] = np.outer(g, g)
+    np.testing.assert_allclose(spreads[0] - spreads[1], added, rtol=1e-4, atol=1e-12)
+    assert added[0, 0] > 1.0
 
 
 def test_without_z_velocity_is_that_of_the_moving_place() -> None:

@@ -104,16 +104,18 @@ def test_one_frame_for_all(tmp_path: Path) -> None:
 
 
 def test_a_wide_map_magnifies_its_ellipses_and_shows_details(tmp_path: Path) -> None:
-    """With ellipses of metres on a map of 100 km there is a detail of the followed boat, on one of 100 m none."""
+    """With ellipses of metres on a map of 100 km there is a detail of each followed boat, on one of 100 m none."""
 
-    def frames(drawn: Pixels) -> int:
-        """Columns with more than 150 dark pixels, the sides of a pair of axes, right of the map."""
-        dark = (drawn[:, int(drawn.shape[1] * 0.7) :] < 130).all(axis=-1)
-        return int((np.diff((dark.sum(axis=0) > 150).astype(int)) == 1).sum())
+    def upright(drawn: Pixels) -> int:
+        """Dark pixels in the darkest column right of the map: the sides of details, one above the other."""
+        return int((drawn[:, int(drawn.shape[1] * 0.7) :] < 130).all(axis=-1).sum(axis=0).max())
 
-    a, b = (pixels(mission_map(harbour(size), tmp_path / "map.png")) for size in (1e5, 100.0))
-    assert frames(a) == 2
-    assert frames(b) == 0
+    wide, narrow = (pixels(mission_map(harbour(size), tmp_path / "map.png")) for size in (1e5, 100.0))
+    second = [tracks("lidar", t, [7], [[6e4, 3000.0 * t]], complete=False) for t in range(21)]
+    two = pixels(mission_map([*harbour(1e5), *second], tmp_path / "map.png"))
+    assert upright(narrow) < 100
+    assert 150 < upright(wide) < 300
+    assert 300 < upright(two) < 600
 
 
 def test_what_is_tentative_or_no_number_is_not_drawn(tmp_path: Path) -> None:
