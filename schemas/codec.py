@@ -67,7 +67,12 @@ def _pack(message: Message) -> bytes:
                 out[key] = value if pack is None else pack(value)
                 if key == "means" and value.shape[1] != len(out["space"]):
                     raise ValueError(f"not {len(out['space'])} components each")
-        return cast(bytes, msgpack.packb(out))
+        try:
+            return cast(bytes, msgpack.packb(out))
+        except (ValueError, TypeError, OverflowError):
+            for key, value in out.items():
+                msgpack.packb(value)
+            raise
     except (ValueError, TypeError, AttributeError, OverflowError, IndexError) as error:
         raise MessageError("bad-field", f"{kind.type}.{key}: {error}") from None
 

@@ -90,6 +90,11 @@ def test_encode_refuses_what_decode_would(attribute: str, value: Any) -> None:
     refused(replace(local(), **{attribute: value}))
 
 
+def test_a_refusal_names_the_field() -> None:
+    for attribute, value in (("seq", np.int64(3)), ("complete", np.True_), ("seq", 2**64), ("origin", {1, 2})):
+        assert refused(replace(local(), **{attribute: value})).startswith(f"bad-field: local_tracks.{attribute}: ")
+
+
 def test_encode_takes_any_integers_and_floats_that_fit() -> None:
     message = local("local_tracks_weights_only")
     other = replace(
