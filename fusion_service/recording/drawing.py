@@ -24,7 +24,7 @@ from fusion_service.recording.columns import Columns, Lines, Points, Stamp, enti
 from fusion_service.recording.geometry import Chart, Outline, Place, ellipses, grid, moments, outline
 from schemas import STATUSES, Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
-__all__ = ["Drawing", "track_label"]
+__all__ = ["Drawing"]
 
 Floats = NDArray[np.float64]
 U64 = NDArray[np.uint64]
@@ -37,12 +37,6 @@ INTENSITY = 0.1
 DEFAULT_PERIOD = 10.0
 KEPT_PERIODS = 3.0
 """How long, in periods of its source, a track stays drawn that an incomplete message does not list."""
-
-
-def track_label(track: int) -> str:
-    """A global id as generation.counter, its upper and lower half."""
-    generation, counter = divmod(int(track), 1 << 32)
-    return f"{generation}.{counter}" if generation else str(counter)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,6 +64,7 @@ class Drawing:
         self.trails: list[str] = []
         self.sources: dict[str, str] = {}
         self.changed = True
+        self._generations: dict[int, int] = {}
         self._tables: dict[str, _Table] = {}
         self._styled: set[str] = set()
         self._info: dict[str, SensorInfo] = {}
@@ -85,6 +80,13 @@ class Drawing:
             x, y, z = (float(message.means[0, message.space.index(name)]) for name in "xyz")
             near = x, y, z
         self.chart = Chart(message.frame, near)
+
+    def label(self, track: int) -> str:
+        """A global id by its lower half, a counter; from the second generation (upper half) seen on, after the number
+        of its generation: 7, 2.7."""
+        generation, counter = divmod(int(track), 1 << 32)
+        number = self._generations.setdefault(generation, len(self._generations) + 1)
+        return f"{number}.{counter}" if number > 1 else str(counter)
 
     @property
     def extent(self) -> tuple[Floats, Floats] | None:
@@ -147,7 +149,7 @@ class Drawing:
         path = entity("picture", "global", message.source)
         self._style(path, palette.FUSED, radius=4.5, width=1.5, alpha=255, labels=True)
         table = self._trail(path, table, 0, stamp)
-        labels = [track_label(track) for track in table.ids]
+        labels = [self.label(track) for track in table.ids.tolist()]
         colours = palette.packed(palette.FUSED, 0) + ALPHA.astype(np.uint32)[table.codes]
         self._columns.points(path, stamp, self._points(table.place, labels, colours.astype(np.uint32)))
         self._ellipses(path, table, stamp, colours.astype(np.uint32))

@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from typing import Any
 
 from fusion_service.recording.columns import Columns, Stamp, documents, entity, texts
-from fusion_service.recording.drawing import track_label
+from fusion_service.recording.drawing import Drawing
 from schemas import GlobalTracks, Status, StepLog
 
 __all__ = ["Journal"]
@@ -24,8 +24,9 @@ SAID_ELSEWHERE = ("found", "lost", "restarted")
 class Journal:
     """Turns messages into lines; repeats of one fault within a message become one line with a number."""
 
-    def __init__(self, columns: Columns) -> None:
+    def __init__(self, columns: Columns, drawing: Drawing) -> None:
         self._columns = columns
+        self._label = drawing.label
         self._epochs: dict[tuple[str, str], int] = {}
         self._health: dict[tuple[str, str], str] = {}
         self._waiting: list[tuple[str, str, str, int]] = []
@@ -71,7 +72,8 @@ class Journal:
                 self.say("sources", INFO if state == "alive" else WARN, f"source {name}: {before} -> {state}", stamp)
             if state == "lost" and before != state:
                 lost.append(name)
-        self._columns.add(entity("health", message.source), documents, stamp, _page(message))
+        if stamp.time is not None:
+            self._columns.add(entity("health", message.source), documents, stamp, _page(message))
         return lost
 
     def step(self, message: StepLog, stamp: Stamp) -> None:
@@ -92,10 +94,10 @@ class Journal:
     def tracks(self, message: GlobalTracks, stamp: Stamp) -> None:
         """Ended, merged and split global tracks."""
         for track, reason, heir in message.ended:
-            into = f", goes on as {track_label(heir)}" if heir is not None else ""
-            self.say("tracks", INFO, f"track {track_label(track)} ended: {reason}{into}", stamp)
+            into = f", goes on as {self._label(heir)}" if heir is not None else ""
+            self.say("tracks", INFO, f"track {self._label(track)} ended: {reason}{into}", stamp)
         for new, old in message.split_from:
-            self.say("tracks", INFO, f"track {track_label(new)} split from {track_label(old)}", stamp)
+            self.say("tracks", INFO, f"track {self._label(new)} split from {self._label(old)}", stamp)
 
 
 def _state(said: dict[str, Any]) -> str:

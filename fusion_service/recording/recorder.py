@@ -140,7 +140,7 @@ class Recorder:
         self._columns = Columns(self._stream)
         self._drawing = Drawing(self._columns, frame)
         self._charts = Charts(self._columns)
-        self._journal = Journal(self._columns)
+        self._journal = Journal(self._columns, self._drawing)
         self._assessment = Assessment(cutoff)
         self.tick()
 
@@ -229,11 +229,12 @@ class Recorder:
             self._stream.send_blueprint(blueprint(frame, drawing.bounds, drawing.trails, self._trail))
 
     def _mission_time(self, message: Message | None) -> int | None:
-        """The time of `message` on the mission's timeline, None where it has none or is impossibly far ahead."""
+        """The time of `message` on the mission's timeline, None where it has none or is impossibly far ahead. That of
+        a status is the service's own until its first step, which may be years from a mission played back."""
         at: int | None = getattr(message, "time", None)
-        if at is None:
+        if at is None or isinstance(message, Status):
             return None
-        from_centre = isinstance(message, GlobalTracks | StepLog | Status)
+        from_centre = isinstance(message, GlobalTracks | StepLog)
         if self._by_centre and not from_centre and self._now is not None and at > self._now + AHEAD:
             return None
         if from_centre or not self._by_centre:
@@ -243,15 +244,15 @@ class Recorder:
 
     def _draw_new(self) -> None:
         held, self._new = self._held + self._new, []
-        self._held = [] if self._open_chart(held) else [item for item in held if isinstance(item[0], Drawable)]
-        drawn = held if self._drawing.chart is not None and self._now is not None else []
-        drawn = drawn or [item for item in held if not isinstance(item[0], Drawable)]
+        ready = self._open_chart(held)
+        drawn = [item for item in held if ready or not _needs_chart(item[0])]
+        self._held = [item for item in held if not ready and _needs_chart(item[0])]
         tracks = [message for message, _ in drawn if isinstance(message, LocalTracks | LocalIntensity | GlobalTracks)]
         faults = dict(zip(map(id, tracks), check_numbers(tracks), strict=True))
         for message, stamp in drawn:
             if stamp.time is None:
                 stamp = stamp._replace(time=self._now)
-                if hasattr(message, "time"):
+                if isinstance(message, LocalTracks | LocalIntensity | Truth):
                     self._not_drawn(message.source, "its time is far ahead", 1, stamp)
                     continue
             fault = faults.get(id(message), np.zeros(0, dtype=np.uint8))
@@ -295,7 +296,8 @@ class Recorder:
         elif isinstance(message, GlobalTracks):
             journal.tracks(message, stamp)
             self._assessment.step(message, stamp)
-            drawing.global_tracks(message, sound, stamp)
+            if drawing.chart is not None:
+                drawing.global_tracks(message, sound, stamp)
             charts.step(message, drawing.colours(), stamp)
         else:
             drawing.local_tracks(message, sound, stamp)
@@ -318,6 +320,10 @@ class Recorder:
         if (source, reason) not in self._said:
             self._said.add((source, reason))
             self._journal.say("recorder", "WARN", f"{source}: {count} not drawn: {reason} (said once)", stamp)
+
+
+def _needs_chart(message: Message) -> bool:
+    return isinstance(message, Drawable) and not (isinstance(message, GlobalTracks) and not len(message.ids))
 
 
 def run_recorder(
