@@ -70,8 +70,8 @@ def _pack(message: Message) -> bytes:
         try:
             return cast(bytes, msgpack.packb(out))
         except (ValueError, TypeError, OverflowError):
-            for key, value in out.items():
-                msgpack.packb(value)
+            for key in out:  # noqa: B007 (the error names it)
+                msgpack.packb(out[key])
             raise
     except (ValueError, TypeError, AttributeError, OverflowError, IndexError) as error:
         raise MessageError("bad-field", f"{kind.type}.{key}: {error}") from None

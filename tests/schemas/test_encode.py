@@ -91,7 +91,8 @@ def test_encode_refuses_what_decode_would(attribute: str, value: Any) -> None:
 
 
 def test_a_refusal_names_the_field() -> None:
-    for attribute, value in (("seq", np.int64(3)), ("complete", np.True_), ("seq", 2**64), ("origin", {1, 2})):
+    slips: dict[str, Any] = {"seq": np.int64(3), "epoch": 2**64, "complete": np.True_, "origin": {1, 2}}
+    for attribute, value in slips.items():
         assert refused(replace(local(), **{attribute: value})).startswith(f"bad-field: local_tracks.{attribute}: ")
 
 
