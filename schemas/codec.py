@@ -70,7 +70,7 @@ def _pack(message: Message) -> bytes:
         try:
             return cast(bytes, msgpack.packb(out))
         except (ValueError, TypeError, OverflowError):
-            for key in out:  # noqa: B007 (the error names it)
+            for key in out:
                 msgpack.packb(out[key])
             raise
     except (ValueError, TypeError, AttributeError, OverflowError, IndexError) as error:
