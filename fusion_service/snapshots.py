@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.densities import moments
 from fusion_service.geodesy import FrameError, transform
 from fusion_service.motion import predict
 from schemas import Frame, GlobalTracks, LocalTracks, Motion, Truth, check_numbers
@@ -160,7 +161,7 @@ def in_frame(messages: Sequence[Tracks], frame: Frame) -> Iterator[tuple[tuple[s
         alike.setdefault(key, []).append(index)
     for indices in alike.values():
         one = messages[indices[0]]
-        parts = [_moments(messages[index]) for index in indices]
+        parts = [moments(m.means, m.covariances, m.weights, m.counts) for m in (messages[index] for index in indices)]
         means, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
         height = one.height if isinstance(one, LocalTracks) else None
         yield one.space, indices, *transform(means, covariances, one.space, one.frame, frame, height)
@@ -201,19 +202,6 @@ def _snapshots(
 
 def _key(message: Tracks, row: int) -> tuple[int, int]:
     return message.epoch if isinstance(message, LocalTracks) else 0, int(message.ids[row])
-
-
-def _moments(message: Tracks) -> tuple[Floats, Floats]:
-    """Mean (T, n) and covariance (T, n, n) of each track's mixture."""
-    if message.counts is None or message.weights is None or not len(message.ids):
-        return message.means, message.covariances
-    counts = message.counts.astype(np.intp)
-    starts = np.cumsum(counts) - counts
-    with np.errstate(all="ignore"):
-        mean = np.add.reduceat(message.weights[:, None] * message.means, starts)
-        offset = message.means - np.repeat(mean, counts, axis=0)
-        spread = message.covariances + offset[:, :, None] * offset[:, None, :]
-        return mean, np.add.reduceat(message.weights[:, None, None] * spread, starts)
 
 
 def _median_step(times: Times) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, linalg
+from fusion_service.densities import moments
 from schemas import Frame, Height, LocalTracks, SensorInfo
 
 __all__ = ["REMEMBERED", "Source", "Tracks", "empty_tracks", "message_tracks", "newest"]
@@ -63,9 +64,7 @@ def message_tracks(message: LocalTracks, sound: NDArray[np.bool_], frame: Frame,
 
     Raises `geodesy.FrameError` where the message's frame cannot be brought into `frame`.
     """
-    means, covariances = message.means, message.covariances
-    if message.counts is not None and message.weights is not None:
-        means, covariances = _moments(message.weights, means, covariances, message.counts.astype(np.intp))
+    means, covariances = moments(message.means, message.covariances, message.weights, message.counts)
     rows = np.flatnonzero(sound)
     rows = rows[np.argsort(message.ids[rows], kind="stable")]
     means, covariances = geodesy.transform(
@@ -85,22 +84,6 @@ def message_tracks(message: LocalTracks, sound: NDArray[np.bool_], frame: Frame,
         fails=np.zeros(len(rows), dtype=np.int64),
         used=none,
     )
-
-
-def _moments(
-    weights: NDArray[np.float64],
-    means: NDArray[np.float64],
-    covariances: NDArray[np.float64],
-    counts: NDArray[np.intp],
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    if not len(counts):
-        return means, covariances
-    starts = np.cumsum(counts) - counts
-    weights = weights / np.repeat(np.add.reduceat(weights, starts), counts)
-    mean = np.add.reduceat(weights[:, None] * means, starts)
-    offset = means - np.repeat(mean, counts, axis=0)
-    spread = covariances + offset[:, :, None] * offset[:, None, :]
-    return mean, np.add.reduceat(weights[:, None, None] * spread, starts)
 
 
 def newest(old: Tracks, new: Tracks) -> Tracks:
