@@ -92,7 +92,7 @@ def best_weights(criterion: str, model: Model, start: FloatArray) -> FloatArray:
         for _ in range(40):
             trial = w + step * dw
             V, D, value = _evaluate(criterion, active, trial)
-            bound = barrier + 1e-4 * step * fall + 1e-12 * (1.0 + np.abs(barrier))
+            bound = barrier + 1e-4 * step * fall + 1e-9 * (1.0 + np.abs(barrier))  # gross failures only
             pending &= ~(value - mu * total(np.log(trial)) <= bound)
             if not pending.any():
                 break

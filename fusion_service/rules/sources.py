@@ -27,7 +27,10 @@ class Sources:
         P = covariances.transpose(1, 2, 0, 3)
         A, dets, margin = linalg.sweep(P)
         worst, least = condition(P, A).max(axis=0), margin.min(axis=0)
-        return cls(means.transpose(1, 0, 2), P, A, dets, worst, least > 1e-14)
+        definite = least > 1e-14
+        if not definite.all():
+            A[..., ~definite] = np.nan  # stops every iteration at once
+        return cls(means.transpose(1, 0, 2), P, A, dets, worst, definite)
 
     @property
     def count(self) -> int:
