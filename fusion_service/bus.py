@@ -59,53 +59,47 @@ class BusStopped(BusError):
 
 
 class _Guard:
-    """A callback of ours as the bus may call it: an exception is logged with its trace, at a bounded rate,
-    and harms nothing else; once `open` is false it is not called any more."""
+    """Stands between the bus and our callbacks: what one raises is logged with its trace, at a bounded rate,
+    and harms nothing else; once `open` is false none begins any more."""
 
-    def __init__(self, name: str, callback: Callable[..., Any]) -> None:
+    def __init__(self, name: str) -> None:
         self.open = True
         self._name = name
-        self._callback = callback
         self._failures = 0
         self._quiet_until = 0.0
 
-    def __call__(self, *arguments: Any) -> Any:
-        if not self.open:
-            return None
-        try:
-            return self._callback(*arguments)
-        except Exception:
-            self._failures += 1
-            if time.monotonic() >= self._quiet_until:
-                log.exception("the handler of %s failed (%d times until now)", self._name, self._failures)
-                self._quiet_until = time.monotonic() + 1.0
-            raise
+    def wrap(self, callback: Callable[[Any], object]) -> Callable[[Any], None]:
+        def call(argument: Any) -> None:
+            if self.open:
+                try:
+                    callback(argument)
+                except Exception:
+                    self.failed()
 
+        return call
 
-def _quietly(guard: _Guard) -> Callable[[Any], None]:
-    def call(argument: Any) -> None:
-        try:
-            guard(argument)
-        except Exception:  # the guard logged it
-            return
-
-    return call
+    def failed(self) -> None:
+        """Log the exception at hand."""
+        self._failures += 1
+        if time.monotonic() >= self._quiet_until:
+            log.exception("the handler of %s failed (%d times until now)", self._name, self._failures)
+            self._quiet_until = time.monotonic() + 1.0
 
 
 class Declaration:
     """Something declared on a bus, taken back by `close` or with the bus. No callback begins after that."""
 
-    def __init__(self, bus: Bus, entities: Sequence[Any], guards: Sequence[_Guard] = ()) -> None:
+    def __init__(self, bus: Bus, entities: Sequence[Any], guard: _Guard | None = None) -> None:
         self._bus = bus
         self._entities = list(entities)
-        self._guards = guards
+        self._guard = guard
         bus._declared[self] = None
 
     def close(self) -> None:
         """Take it back; a second call does nothing."""
         self._bus._declared.pop(self, None)
-        for guard in self._guards:
-            guard.open = False
+        if self._guard is not None:
+            self._guard.open = False
         while self._entities:
             self._entities.pop().undeclare()
 
@@ -116,12 +110,12 @@ class Publisher(Declaration):
     def put(self, data: bytes) -> None:
         """Publish `data`; never waits for a slow reader. While the hub is away nothing is sent, but the last
         `cache` samples go out when it is back. `BusError` if it is closed or the data are too long."""
-        if not self._entities:
-            raise BusError("this publisher is closed")
         if len(data) > MAX_BYTES:
             raise BusError(f"{len(data)} bytes are too many for one message: at most {MAX_BYTES}")
         try:
             self._entities[0].put(data)
+        except IndexError:
+            raise BusError("this publisher is closed") from None
         except zenoh.ZError as error:
             raise BusError(f"cannot publish: {_reason(error)}") from None
 
@@ -183,20 +177,20 @@ class Bus:
             if on_miss:
                 on_miss(keys.get(str(miss.source), key_expression), miss.nb)
 
-        guards = [_Guard(key_expression, receive), _Guard(f"misses on {key_expression}", missed)]
+        guard = _Guard(key_expression)
         past = ext.HistoryConfig(detect_late_publishers=True, max_samples=int(history)) if history else None
         with _readable(key_expression):
             subscriber = ext.declare_advanced_subscriber(
                 self._session,
                 key_expression,
-                _quietly(guards[0]),
+                guard.wrap(receive),
                 history=past,
                 recovery=ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
             )
         entities: list[Any] = [subscriber]
         if on_miss:
-            entities.append(subscriber.sample_miss_listener(_quietly(guards[1])))
-        return Declaration(self, entities, guards)
+            entities.append(subscriber.sample_miss_listener(guard.wrap(missed)))
+        return Declaration(self, entities, guard)
 
     def announce(self, key: str) -> Declaration:
         """A liveliness token: `watch` elsewhere sees it appear, and go when it is closed or the process dies."""
@@ -210,27 +204,26 @@ class Bus:
         def change(sample: Any) -> None:
             callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
-        guard = _Guard(f"liveliness of {key_expression}", change)
+        guard = _Guard(key_expression)
         with _readable(key_expression):
-            entity = self._session.liveliness().declare_subscriber(key_expression, _quietly(guard), history=True)
-        return Declaration(self, [entity], [guard])
+            entity = self._session.liveliness().declare_subscriber(key_expression, guard.wrap(change), history=True)
+        return Declaration(self, [entity], guard)
 
     def answer(self, key: str, handler: Callable[[bytes | None], bytes]) -> Declaration:
         """Answer every `ask` on `key` with `handler(payload)`. If it raises, who asked is told."""
-        guard = _Guard(f"questions on {key}", handler)
+        guard = _Guard(key)
 
         def reply(query: Any) -> None:
             with query:
                 try:
-                    answer = guard(None if query.payload is None else bytes(query.payload))
-                except Exception as error:  # the guard logged it
+                    answer = handler(None if query.payload is None else bytes(query.payload))
+                except Exception as error:
                     query.reply_err(str(error) or type(error).__name__)
-                else:
-                    if answer is not None:
-                        query.reply(key, answer)
+                    raise
+                query.reply(key, answer)
 
         with _readable(key):
-            return Declaration(self, [self._session.declare_queryable(key, reply)], [guard])
+            return Declaration(self, [self._session.declare_queryable(key, guard.wrap(reply))], guard)
 
     def ask(self, key: str, payload: bytes | None = None, timeout: float = 1.0) -> list[tuple[str, bytes]]:
         """Ask everyone who answers on `key` (an expression may reach several): (key, data) of each answer,

@@ -4,8 +4,14 @@ import pytest
 from processes import Hub
 
 
-@pytest.fixture
-def hub() -> Iterator[Hub]:
-    hub = Hub().start()
+@pytest.fixture(scope="session")
+def one_hub() -> Iterator[Hub]:
+    hub = Hub()
     yield hub
     hub.kill()
+
+
+@pytest.fixture
+def hub(one_hub: Hub) -> Hub:
+    """A hub that runs. A test may kill it: the next one finds it started again."""
+    return one_hub.start()

@@ -56,6 +56,11 @@ class Program:
     def signal(self, number: signal.Signals) -> None:
         self._process.send_signal(number)
 
+    def freeze(self) -> None:
+        """Stop it, and wait until it has stopped. SIGCONT lets it go on."""
+        self.signal(signal.SIGSTOP)
+        os.waitpid(self._process.pid, os.WUNTRACED)
+
     def kill(self) -> None:
         self._process.kill()
         self._process.wait()

@@ -156,7 +156,7 @@ def test_a_frozen_reader_holds_up_nobody_and_its_gap_is_recovered_or_counted(
         assert reader.line() == "ready"
         publisher.put(number(0))
         assert reader.line() == "got 0"
-        reader.signal(signal.SIGSTOP)
+        reader.freeze()
         slowest = 0.0
         for i in range(1, 301):
             begin = time.monotonic()
@@ -180,6 +180,34 @@ def test_a_frozen_reader_holds_up_nobody_and_its_gap_is_recovered_or_counted(
         assert missed > 0  # or nothing was lost on the way and this test shows nothing
     else:
         assert missed == 0
+
+
+def test_a_frozen_publisher_does_not_keep_a_new_subscriber_waiting(hub: Hub, sessions: tuple[Bus, Bus]) -> None:
+    here, there = sessions
+    code = """
+import sys
+from fusion_service.bus import open_bus
+with open_bus([sys.argv[1]]) as bus:
+    publisher = bus.publisher("t/frozen", cache=8)
+    publisher.put(b"-1")
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+    before: list[str] = []
+    here.subscribe("t/*", lambda key, data: before.append(key))
+    publisher = here.publisher("t/a", cache=8)
+    publisher.put(number(0))
+    with Program(code, hub.endpoint) as frozen:
+        assert frozen.line() == "ready"
+        eventually(lambda: set(before) == {"t/a", "t/frozen"})
+        frozen.freeze()
+        got: list[int] = []
+        there.subscribe("t/*", lambda key, data: got.append(int(data)))
+        eventually(lambda: got == [0], 1.0)
+        publisher.put(number(1))
+        eventually(lambda: got == [0, 1], 1.0)
+        frozen.signal(signal.SIGCONT)
+        eventually(lambda: got == [0, 1, -1])
 
 
 def test_a_consumer_that_takes_nothing_blocks_nothing(sessions: tuple[Bus, Bus]) -> None:
