@@ -8,16 +8,16 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterable
-from typing import Any
 
 from sensor_clients.events import Event
+from sensor_clients.publisher import TrackPublisher, TruthPublisher
 
 __all__ = ["pace"]
 
 
 def pace(
     events: Iterable[Event],
-    publisher: Any,
+    publisher: TrackPublisher | TruthPublisher,
     *,
     start: int,
     start_at: float,
@@ -37,11 +37,11 @@ def pace(
             stop.wait(min(wait, 1.0))
         if stop.is_set():
             break
-        if event.kind == "info":
-            publisher.info(**event.fields)
-        elif event.kind == "tracks":
-            publisher.tracks(time=event.time, **event.fields)
-        else:
+        if isinstance(publisher, TruthPublisher):
             publisher.truth(time=event.time, **event.fields)
+        elif event.kind == "info":
+            publisher.info(**event.fields)
+        else:
+            publisher.tracks(time=event.time, **event.fields)
         published += 1
     return published

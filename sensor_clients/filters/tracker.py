@@ -32,8 +32,9 @@ class TrackerConfig:
     standard deviation per axis of a new track's velocity, m/s; gate: squared Mahalanobis distance;
     confirm, drop: existence at which a track is first reported and at which it ends, for a tentative track
     `drop_tentative`; max_sigma: a track whose position is less certain than this (m, along the worst of
-    its axes) ends; merge: squared distance of two tracks, under the sum of their covariances, below which
-    the younger ends; cubature: CKF, else EKF."""
+    its axes) ends; merge: squared distance of two tracks, under the sum of their covariances and `extent`^2
+    (m2) on each axis of the place, below which the younger ends: returns of one large target; min_way: a
+    track is reported once it is so far, m, from where it started (0: at once); cubature: CKF, else EKF."""
 
     motion: Motion
     survival: float
@@ -44,6 +45,8 @@ class TrackerConfig:
     drop_tentative: float = 0.01
     max_sigma: float = math.inf
     merge: float = 0.0
+    extent: float = 0.0
+    min_way: float = 0.0
     cubature: bool = True
 
 
@@ -63,7 +66,8 @@ class Report:
 class LocalTracker:
     """Tracks of one sensor. Not for several threads.
 
-    ids: (T,) i64, never used twice; means (4, T), covariances (4, 4, T), existence (T,).
+    ids: (T,) i64, never used twice; first (2, T): where each started; means (4, T), covariances (4, 4, T),
+    existence (T,).
     """
 
     def __init__(self, config: TrackerConfig) -> None:
@@ -75,6 +79,7 @@ class LocalTracker:
         self.ids: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self.updated: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self.confirmed: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
+        self.first: Floats = np.zeros((2, 0))
         self._next = 1
 
     def predict(self, time: int) -> None:
@@ -94,10 +99,12 @@ class LocalTracker:
         clutter: Floats,
         birth: Floats,
         detection: Callable[[Floats], Floats],
-    ) -> None:
+    ) -> Floats:
         """One scan at `time`, ns: returns (2, M), with the intensities of clutter and of first returns of new
         targets at each (M,), per unit of measurement space; `detection` gives the probability (T,) that a
-        target at a place (2, T) is seen: 0 outside the field of view, where tracks end."""
+        target at a place (2, T) is seen: 0 outside the field of view, where tracks end.
+
+        Returns the probability (M,) that each return is of no confirmed track."""
         config = self.config
         self.predict(time)
         p = detection(self.means[:2])
@@ -107,19 +114,28 @@ class LocalTracker:
         found = associate(likelihood(prediction, config.gate), self.existence, p, clutter + birth)
         self.means, self.covariances = update(self.means, self.covariances, prediction, found.weights, found.missed)
         self.existence = found.existence
+        reported = np.where(self.confirmed, found.existence, 0.0) @ found.weights
         self.updated = np.where(found.missed < 0.5, time, self.updated)
         self._prune()
         self._start(returns, model, found.unused * birth / (clutter + birth))
-        self.confirmed = self.confirmed | (self.existence >= config.confirm)
+        way = np.hypot(*(self.means[:2] - self.first))
+        self.confirmed = self.confirmed | ((self.existence >= config.confirm) & (way >= config.min_way))
+        return np.asarray(1.0 - reported)
 
-    def report(self, select: NDArray[np.bool_] | None = None) -> Report:
-        """The confirmed tracks, or those of them that `select` (T,) names, at the time of the last step."""
-        chosen = self.confirmed if select is None else self.confirmed & select
+    def report(self, time: int | None = None) -> Report:
+        """The confirmed tracks at the time of the last step, or predicted on to `time`, ns."""
+        chosen = self.confirmed
+        means, covariances = self.means[:, chosen], self.covariances[..., chosen]
+        now = self.time or 0
+        if time is not None and time != now:
+            dt = np.full(means.shape[1], (time - now) * 1e-9)
+            means, covariances = motion.predict(self.config.motion, STATE, means, covariances, dt)
+            now = time
         return Report(
-            self.time or 0,
+            now,
             self.ids[chosen].astype(np.uint64),
-            np.ascontiguousarray(self.means[:, chosen].T),
-            np.ascontiguousarray(self.covariances[..., chosen].transpose(2, 0, 1)),
+            np.ascontiguousarray(means.T),
+            np.ascontiguousarray(covariances.transpose(2, 0, 1)),
             self.existence[chosen],
             self.updated[chosen],
         )
@@ -134,6 +150,7 @@ class LocalTracker:
         self.means = np.concatenate([self.means, np.concatenate([place, np.zeros((2, count))])], axis=1)
         self.covariances = np.concatenate([self.covariances, covariances], axis=2)
         self.existence = np.concatenate([self.existence, existence[chosen]])
+        self.first = np.concatenate([self.first, place], axis=1)
         self.ids = np.concatenate([self.ids, np.arange(self._next, self._next + count)])
         self.updated = np.concatenate([self.updated, np.full(count, self.time, dtype=np.int64)])
         self.confirmed = np.concatenate([self.confirmed, np.zeros(count, dtype=np.bool_)])
@@ -148,9 +165,9 @@ class LocalTracker:
         self._keep((self.existence >= floor) & (worst <= config.max_sigma**2))
         if config.merge and len(self.ids) > 1:
             i, j = np.triu_indices(len(self.ids), 1)
-            apart = linalg.quadratic(
-                self.covariances[..., i] + self.covariances[..., j], self.means[:, i] - self.means[:, j]
-            )
+            spread = self.covariances[..., i] + self.covariances[..., j]
+            spread[[0, 1], [0, 1]] += config.extent**2
+            apart = linalg.quadratic(spread, self.means[:, i] - self.means[:, j])
             keep = np.ones(len(self.ids), dtype=np.bool_)
             # Tracks stand in the order of their age.
             for first, second in zip(i[apart < config.merge], j[apart < config.merge], strict=True):
@@ -160,5 +177,6 @@ class LocalTracker:
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         if not chosen.all():
             self.means, self.covariances = self.means[:, chosen], self.covariances[..., chosen]
+            self.first = self.first[:, chosen]
             self.existence, self.ids = self.existence[chosen], self.ids[chosen]
             self.updated, self.confirmed = self.updated[chosen], self.confirmed[chosen]

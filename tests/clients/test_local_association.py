@@ -58,9 +58,9 @@ def test_marginals_are_exact_on_trees(pattern: list[list[int]], seed: int) -> No
     rng = np.random.default_rng(seed)
     gated = np.array(pattern, dtype=float)
     T, M = gated.shape
-    densities = gated * rng.uniform(0.01, 2.0, (T, M))
-    existence, detection = rng.uniform(0.05, 1.0, T), rng.uniform(0.1, 0.99, T)
-    intensity = rng.uniform(0.01, 0.5, M)
+    densities = gated * rng.uniform(0.01, 2.0, size=gated.shape)
+    existence, detection = rng.uniform(0.05, 1.0, size=(T,)), rng.uniform(0.1, 0.99, size=(T,))
+    intensity = rng.uniform(0.01, 0.5, size=(M,))
     found = associate(densities, existence, detection, intensity, tolerance=1e-12)
     exists, taken, unused = enumerate_events(densities, existence, detection, intensity)
     np.testing.assert_allclose(found.existence, exists, atol=1e-9)
@@ -74,8 +74,9 @@ def test_marginals_are_close_where_all_compete() -> None:
     worst = 0.0
     for _ in range(50):
         densities = rng.uniform(0.01, 2.0, (3, 3))
-        existence, detection = rng.uniform(0.3, 1.0, (2, 3))
-        intensity = rng.uniform(0.05, 0.5, 3)
+        existence = rng.uniform(0.3, 1.0, size=(3,))
+        detection = rng.uniform(0.3, 1.0, size=(3,))
+        intensity = rng.uniform(0.05, 0.5, size=(3,))
         found = associate(densities, existence, detection, intensity)
         exists, taken, _ = enumerate_events(densities, existence, detection, intensity)
         worst = max(

@@ -1,0 +1,181 @@
+"""`sensor-client`: simulated and recorded sensors, each a process of its own on the bus."""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from fusion_service.bus import DEFAULT_ENDPOINT, BusError, BusStopped
+from schemas import REALM, check_realm
+from sensor_clients.events import Event, Scenario
+from sensor_clients.playback import autoferry
+from sensor_clients.publisher import TrackPublisher, TruthPublisher
+from sensor_clients.runner import pace
+from sensor_clients.scenarios.three_radars import three_radars
+
+__all__ = ["main"]
+
+EXAMPLES = """examples:
+  sensor-client list
+  sensor-client simulate three-radars --sensor radar1
+  sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
+  sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
+"""
+
+
+class UsageError(Exception):
+    """The command cannot be carried out as given; the message says how to mend it."""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; 0: done, 2: bad usage, 1: failure with one line on stderr."""
+    arguments = _parser().parse_args(argv)
+    try:
+        return int(arguments.run(arguments))
+    except UsageError as error:
+        print(f"sensor-client: {error}", file=sys.stderr)
+        return 2
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (BusError, OSError, ValueError) as error:
+        print(f"sensor-client: {error}", file=sys.stderr)
+        return 1
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="sensor-client",
+        description="Publish the tracks of one simulated or recorded sensor, or the truth.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(required=True, metavar="COMMAND")
+    simulate = _command(commands, "simulate", "simulate a sensor and its local tracker", EXAMPLES)
+    simulate.add_argument("scenario", help="three-radars")
+    simulate.add_argument("--seed", type=_whole, default=0, help="seed of noise and clutter (default 0)")
+    simulate.set_defaults(run=_simulate)
+    playback = _command(commands, "playback", "play recorded returns through a local tracker", EXAMPLES)
+    playback.add_argument("scenario", help="autoferry:N, N one of " + ", ".join(map(str, autoferry.SCENARIOS)))
+    playback.add_argument("--data", type=Path, help="directory of the scenario files (default: $FUSION_DATA)")
+    playback.set_defaults(run=_playback)
+    for command in (simulate, playback):
+        command.add_argument("--sensor", required=True, help="which of the scenario's sensors, or truth")
+        command.add_argument("--connect", default=DEFAULT_ENDPOINT, help=f"the hub (default {DEFAULT_ENDPOINT})")
+        command.add_argument("--realm", default=REALM, help=f"first part of every key (default {REALM})")
+        command.add_argument("--speed", type=_positive, default=1.0, help="scenario seconds per second (default 1)")
+        command.add_argument(
+            "--start-at", type=float, metavar="UNIX_SECONDS", help="when the scenario starts (default: now)"
+        )
+        command.add_argument("--duration", type=_positive, metavar="S", help="stop after S seconds of the scenario")
+    listing = _command(commands, "list", "scenarios, their sensors and parameters with their sources", EXAMPLES)
+    listing.set_defaults(run=_list)
+    return parser
+
+
+def _command(commands: Any, name: str, text: str, epilog: str) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = commands.add_parser(
+        name, help=text, description=text, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    return parser
+
+
+def _positive(text: str) -> float:
+    value = float(text)
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
+    return value
+
+
+def _whole(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{text} is negative")
+    return value
+
+
+def _list(_: argparse.Namespace) -> int:
+    print(_describe(three_radars(), "simulate three-radars"))
+    print()
+    print(f"playback autoferry:N  N in {', '.join(map(str, autoferry.SCENARIOS))}: {autoferry.SUMMARY}")
+    print(f"  sensors: {', '.join(autoferry.SENSORS)}, truth; needs --data or FUSION_DATA")
+    print(_table(autoferry.PARAMETERS))
+    return 0
+
+
+def _describe(scenario: Scenario, command: str) -> str:
+    head = f"{command}  {scenario.summary}\n  sensors: {', '.join(scenario.sensors)}, truth"
+    return f"{head}\n{_table(scenario.parameters)}"
+
+
+def _table(parameters: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[column]) for row in parameters) for column in range(2)]
+    return "\n".join(f"    {name:{widths[0]}}  {value:{widths[1]}}  {source}" for name, value, source in parameters)
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    if arguments.scenario != "three-radars":
+        raise UsageError(f"no simulated scenario {arguments.scenario!r}; known: three-radars")
+    return _publish(three_radars(), arguments, arguments.seed)
+
+
+def _playback(arguments: argparse.Namespace) -> int:
+    name, _, number = arguments.scenario.partition(":")
+    if name != "autoferry" or number not in map(str, autoferry.SCENARIOS):
+        known = ", ".join(f"autoferry:{n}" for n in autoferry.SCENARIOS)
+        raise UsageError(f"no recorded scenario {arguments.scenario!r}; known: {known}")
+    data = arguments.data or os.environ.get("FUSION_DATA")
+    if not data:
+        raise UsageError("no data: say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")
+    return _publish(autoferry.load(Path(data), int(number)), arguments, 0)
+
+
+def _publish(scenario: Scenario, arguments: argparse.Namespace, seed: int) -> int:
+    sensor = arguments.sensor
+    if sensor != "truth" and sensor not in scenario.sensors:
+        raise UsageError(f"no sensor {sensor!r} in {scenario.name}; known: {', '.join(scenario.sensors)}, truth")
+    try:
+        check_realm(arguments.realm)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    events: Iterator[Event]
+    kind: type[TrackPublisher] | type[TruthPublisher]
+    if sensor == "truth":
+        events, name, kind = scenario.truth(), scenario.name, TruthPublisher
+    else:
+        events, name, kind = scenario.sensors[sensor](seed), sensor, TrackPublisher
+    if arguments.duration is not None:
+        end = scenario.start + round(arguments.duration * 1e9)
+        events = itertools.takewhile(lambda event: event.time <= end, events)
+    where = {"connect": arguments.connect, "realm": arguments.realm, "origin": scenario.origin}
+    with _stopped_by_signals() as stop, suppress(BusStopped), kind(name, stop=stop, **where) as publisher:
+        start_at = time.time() if arguments.start_at is None else arguments.start_at
+        pace(events, publisher, start=scenario.start, start_at=start_at, speed=arguments.speed, stop=stop)
+    return 0
+
+
+@contextmanager
+def _stopped_by_signals() -> Iterator[threading.Event]:
+    """An event that SIGINT and SIGTERM set; a second signal ends the process at once."""
+    stop = threading.Event()
+
+    def handle(number: int, frame: object) -> None:
+        if stop.is_set():
+            os._exit(128 + number)
+        stop.set()
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)

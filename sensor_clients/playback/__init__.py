@@ -1,0 +1,1 @@
+"""Recorded returns and truth from files, each sensor with its own local tracker."""

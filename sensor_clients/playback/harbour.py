@@ -1,0 +1,209 @@
+"""Local trackers for a lidar and a radar on a ship in a harbour, with what is known of each sensor as data."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.sparse.csgraph import connected_components
+
+from schemas import Motion
+from sensor_clients.events import Parameter
+from sensor_clients.filters import LocalTracker, Position, Report, TrackerConfig
+from sensor_clients.filters.measurement import Floats
+
+__all__ = ["LIDAR", "RADAR", "HarbourSensor", "HarbourTracker", "cluster"]
+
+SECOND = 10**9
+
+
+@dataclass(frozen=True, slots=True)
+class HarbourSensor:
+    """A sensor that gives places. Lengths in m, times in s, intensities per m2 and scan.
+
+    latency: how long ago a return with this time stamp was true; sigma_range, sigma_cross, sigma_azimuth:
+    noise as in `Position`; offset: how far inside a vessel its reference point lies, seen from the sensor;
+    reference: standard deviation per axis of what remains of that, the same from scan to scan, so it is added
+    to what is reported and not to the noise; cluster: returns closer than this to one another are one; blind:
+    returns nearer than this are the own ship's; reach: returns beyond are not looked at; detection: range and
+    probability that a vessel is seen, linear between; clutter, births: intensities of false returns (before
+    any are learned) and of vessels seen for the first time; map_sigma, map_scans: of the `ClutterMap`;
+    coverage, coverage_detection, initiation_delay: what the info says.
+    """
+
+    name: str
+    sensor_id: int
+    period: float
+    latency: float
+    sigma_range: float
+    sigma_cross: float
+    sigma_azimuth: float
+    offset: float
+    reference: float
+    cluster: float
+    blind: float
+    reach: float
+    detection: tuple[tuple[float, float], ...]
+    clutter: float
+    births: float
+    map_sigma: float
+    map_scans: float
+    coverage: float
+    coverage_detection: float
+    initiation_delay: float
+    tracker: TrackerConfig
+
+    def parameters(self) -> list[Parameter]:
+        """One row for `sensor-client list` per number."""
+        return [
+            Parameter(f"{self.name}: {field.name}", str(getattr(self, field.name)), "chosen")
+            for field in fields(self)
+            if field.name not in ("name", "sensor_id", "tracker")
+        ]
+
+
+LIDAR = HarbourSensor(
+    name="lidar",
+    sensor_id=1,
+    period=0.5,
+    latency=0.7,
+    sigma_range=2.4,
+    sigma_cross=3.5,
+    sigma_azimuth=0.0,
+    offset=1.5,
+    reference=1.0,
+    cluster=3.0,
+    blind=3.5,
+    reach=200.0,
+    detection=((0.0, 0.75), (70.0, 0.75), (100.0, 0.05), (200.0, 0.02)),
+    clutter=2e-6,
+    births=7e-8,
+    map_sigma=25.0,
+    map_scans=20.0,
+    coverage=75.0,
+    coverage_detection=0.8,
+    initiation_delay=3.0,
+    tracker=TrackerConfig(
+        motion=Motion("cv", 0.06),
+        survival=0.985,
+        sigma_speed=6.0,
+        confirm=0.95,
+        drop=0.002,
+        drop_tentative=0.002,
+        max_sigma=12.0,
+        merge=5.0,
+        extent=13.0,
+        min_way=12.0,
+    ),
+)
+
+RADAR = HarbourSensor(
+    name="radar",
+    sensor_id=2,
+    period=1.678,
+    latency=2.2,
+    sigma_range=2.0,
+    sigma_cross=3.0,
+    sigma_azimuth=0.01,
+    offset=0.0,
+    reference=2.0,
+    cluster=10.0,
+    blind=7.0,
+    reach=400.0,
+    detection=((0.0, 0.7), (400.0, 0.7)),
+    clutter=1e-5,
+    births=1e-7,
+    map_sigma=45.0,
+    map_scans=10.0,
+    coverage=200.0,
+    coverage_detection=0.8,
+    initiation_delay=10.0,
+    tracker=TrackerConfig(
+        motion=Motion("cv", 0.05),
+        survival=0.99,
+        sigma_speed=3.5,
+        confirm=0.95,
+        drop=0.3,
+        drop_tentative=0.005,
+        max_sigma=5.0,
+        merge=1.0,
+        extent=15.0,
+        min_way=12.0,
+    ),
+)
+
+
+def cluster(returns: Floats, distance: float) -> Floats:
+    """Centres (2, K) of the groups of returns (2, M) linked by gaps below `distance`."""
+    if returns.shape[1] < 2 or distance <= 0:
+        return returns
+    near = np.hypot(*(returns[:, :, None] - returns[:, None])) < distance
+    count, label = connected_components(near, directed=False)
+    member = (label == np.arange(count)[:, None]) / np.bincount(label)[:, None]
+    return np.asarray(returns @ member.T)
+
+
+class ClutterMap:
+    """Intensity of false returns, learned from those that no reported track claims, what lies still among them:
+    a gamma prior of `prior` (1/m2 and scan) worth `scans` scans, and a Gaussian kernel of `sigma` m about every
+    return since."""
+
+    def __init__(self, prior: float, sigma: float, scans: float) -> None:
+        self._prior, self._sigma, self._scans = prior, sigma, scans
+        self._places: Floats = np.zeros((2, 0))
+        self._weights: Floats = np.zeros(0)
+        self._learned = 0
+
+    def intensity(self, places: Floats) -> Floats:
+        """Intensity (M,) at places (2, M)."""
+        squared = np.sum((places[:, :, None] - self._places[:, None]) ** 2, axis=0)
+        kernel = np.exp(-0.5 * squared / self._sigma**2) / (2 * np.pi * self._sigma**2)
+        return np.asarray((self._prior * self._scans + kernel @ self._weights) / (self._scans + self._learned))
+
+    def learn(self, returns: Floats, unused: Floats) -> None:
+        """One scan's returns (2, M) with the probability (M,) of each that it is of no reported track."""
+        self._places = np.concatenate([self._places, returns], axis=1)
+        self._weights = np.concatenate([self._weights, unused])
+        self._learned += 1
+
+
+class HarbourTracker:
+    """The local tracker of one `HarbourSensor`, scan by scan."""
+
+    def __init__(self, sensor: HarbourSensor) -> None:
+        self.sensor = sensor
+        self.tracker = LocalTracker(sensor.tracker)
+        self.clutter = ClutterMap(sensor.clutter, sensor.map_sigma, sensor.map_scans)
+
+    def step(self, time: int, own: Floats, returns: Floats) -> None:
+        """One scan stamped `time`, ns: own ship's place (2,), returns (2, M) in the same frame, m."""
+        sensor = self.sensor
+        sight = returns - own[:, None]
+        distance = np.hypot(*sight)
+        kept = (distance >= sensor.blind) & (distance <= sensor.reach)
+        returns, sight, distance = returns[:, kept], sight[:, kept], distance[kept]
+        if sensor.offset:
+            returns = returns + sensor.offset * sight / distance
+        returns = cluster(returns, sensor.cluster)
+        model = Position(sensor.sigma_range, sensor.sigma_cross, sensor.sigma_azimuth, (float(own[0]), float(own[1])))
+        ranges, probabilities = np.array(sensor.detection).T
+
+        def detection(place: Floats) -> Floats:
+            return np.asarray(np.interp(np.hypot(*(place - own[:, None])), ranges, probabilities, right=0.0))
+
+        count = returns.shape[1]
+        unused = self.tracker.step(
+            time - round(sensor.latency * SECOND),
+            returns,
+            model,
+            self.clutter.intensity(returns),
+            np.full(count, sensor.births),
+            detection,
+        )
+        self.clutter.learn(returns, unused)
+
+    def report(self, time: int) -> Report:
+        """The confirmed tracks, predicted to `time`, ns."""
+        report = self.tracker.report(time)
+        report.covariances[:, [0, 1], [0, 1]] += self.sensor.reference**2
+        return report
