@@ -44,6 +44,7 @@ __all__ = [
     "to_last",
     "total",
     "trace",
+    "trace_inverse_det",
 ]
 
 FloatArray = NDArray[np.float64]
@@ -83,7 +84,8 @@ def to_first(a: FloatArray, batch: tuple[int, ...], core: int) -> FloatArray:
 
 def blocks(n: int, size: int, copies: int = 1) -> Iterator[slice]:
     """Slices that cut a batch of `size` elements, each of `copies` n x n matrices, into pieces for the cache."""
-    step = min(4096, max(256, CACHE_BYTES // (8 * n * n * max(copies, 1))))
+    most = min(4096, max(256, CACHE_BYTES // (8 * n * n * max(copies, 1))))
+    step = -(-size // -(-size // most)) if size else 1
     return (slice(i, min(i + step, size)) for i in range(0, size, step))
 
 
@@ -107,11 +109,28 @@ def sweep(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return out, det, margin
 
 
-def _sweep(P: FloatArray, out: FloatArray, det: FloatArray, margin: FloatArray) -> None:
-    """P^-1 = W' D^-1 W with W = L^-1, as LAPACK's potri does it."""
+def trace_inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """tr P^-1 (B,) and det P (B,)."""
+    trace, det, margin = (np.empty(P.shape[2:], P.dtype) for _ in range(3))
+    with np.errstate(all="ignore"):
+        for part in blocks(len(P), P.shape[-1], prod(P.shape[2:-1])):
+            W, r = _factor(P[..., part], det[..., part], margin[..., part])
+            trace[..., part] = r[0]
+            for k in range(1, len(P)):
+                square = W[k, 0] * W[k, 0]
+                for j in range(1, k):
+                    square += W[k, j] * W[k, j]
+                square += 1.0
+                square *= r[k]
+                trace[..., part] += square
+    return trace, det
+
+
+def _factor(P: FloatArray, det: FloatArray, margin: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """W = L^-1 below the diagonal, and 1 / d, of P = L diag(d) L'. Writes det and margin (see `sweep`)."""
     n = len(P)
     A = np.empty(P.shape, P.dtype)
-    N = np.empty(P.shape, P.dtype)  # -L, then W, below the diagonal
+    W = np.empty(P.shape, P.dtype)  # holds -L first
     r = np.empty(P.shape[1:], P.dtype)
     for i in range(n):
         A[i, : i + 1] = P[i, : i + 1]
@@ -124,20 +143,26 @@ def _sweep(P: FloatArray, out: FloatArray, det: FloatArray, margin: FloatArray) 
             det[...] = d
             margin[...] = d / np.abs(d)
         np.divide(1.0, d, out=r[k])
-        np.multiply(A[k + 1 :, k], -r[k], out=N[k + 1 :, k])
+        np.multiply(A[k + 1 :, k], -r[k], out=W[k + 1 :, k])
         for i in range(k + 1, n):
-            A[i, k + 1 : i + 1] += N[i, k] * A[k + 1 : i + 1, k]
+            A[i, k + 1 : i + 1] += W[i, k] * A[k + 1 : i + 1, k]
     for i in range(2, n):
-        row = N[i, :i].copy()
+        row = W[i, :i].copy()
         for k in range(1, i):
-            N[i, :k] += row[k] * N[k, :k]
-    for k in range(n):
-        scaled = N[k, :k] * r[k]
+            W[i, :k] += row[k] * W[k, :k]
+    return W, r
+
+
+def _sweep(P: FloatArray, out: FloatArray, det: FloatArray, margin: FloatArray) -> None:
+    """P^-1 = W' D^-1 W with W = L^-1, as LAPACK's potri does it."""
+    W, r = _factor(P, det, margin)
+    for k in range(len(P)):
+        scaled = W[k, :k] * r[k]
         out[k, :k] = scaled
         out[k, k] = r[k]
         for i in range(k):
-            out[i, : i + 1] += scaled[i] * N[k, : i + 1]
-    for i in range(1, n):
+            out[i, : i + 1] += scaled[i] * W[k, : i + 1]
+    for i in range(1, len(P)):
         out[:i, i] = out[i, :i]
 
 

@@ -51,6 +51,11 @@ def test_against_numpy(case: tuple[int, Array, Array]) -> None:
     close = {"rtol": 1e-10, "atol": 1e-10}
     want = np.linalg.inv(P)
     inverse, det, _ = linalg.sweep(p)
+    np.testing.assert_allclose(linalg.trace_inverse_det(p)[0], np.trace(want, axis1=1, axis2=2), rtol=1e-10)
+    np.testing.assert_allclose(linalg.trace_inverse_det(p)[1], np.linalg.det(P), rtol=1e-10)
+    np.testing.assert_allclose(linalg.trace(p), np.trace(P, axis1=1, axis2=2), rtol=1e-12)
+    np.testing.assert_allclose(linalg.inner(p, inverse), np.full(40, len(p)), rtol=1e-10)
+    np.testing.assert_allclose(linalg.product(p, inverse).transpose(2, 0, 1), P @ want, **close)
     np.testing.assert_allclose(linalg.to_first(inverse, (40,), 2), want, **close)
     np.testing.assert_array_equal(inverse, inverse.swapaxes(0, 1))
     np.testing.assert_array_equal(linalg.inverse(p), inverse)
@@ -90,6 +95,7 @@ OPERATIONS: dict[str, Callable[[Array, Array], Array]] = {
     "congruence": lambda p, v: linalg.congruence(p[:2], p),
     "shared": lambda p, v: linalg.congruence(np.tri(len(p)), p),
     "matvec": linalg.matvec,
+    "trace": lambda p, v: linalg.trace_inverse_det(p)[0],
     "definite": lambda p, v: linalg.is_positive_definite(p),
 }
 

@@ -185,7 +185,7 @@ def fuse_last(
 
 
 def _parts(size: int, N: int, n: int) -> Iterator[slice]:
-    return linalg.blocks(n, size, max(N, 2))
+    return linalg.blocks(n, size, max(N // 2, 1))
 
 
 def _run(

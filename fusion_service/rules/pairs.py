@@ -51,8 +51,7 @@ def best_weight(
     if criterion == "det":
         det[1:-1, 0] = linalg.det(between)
         return _newton(_det_slope, to_coefficients, det, n, rho)
-    inverse, det[1:-1, 0], _ = linalg.sweep(between)
-    adjugate[1:-1, 0] = linalg.trace(inverse)
+    adjugate[1:-1, 0], det[1:-1, 0] = linalg.trace_inverse_det(between)
     adjugate[0, 0], adjugate[-1, 0] = linalg.trace(inverses[0]), linalg.trace(inverses[1])
     return _newton(_trace_slope, to_coefficients, np.concatenate([det, adjugate * det], axis=1), n, rho)
 
@@ -141,35 +140,39 @@ def _newton(slope: Slope, to_coefficients: FloatArray, values: FloatArray, n: in
     for column, row in zip(to_coefficients.T[1:], values[1:], strict=True):
         c += column[:, None, None] * row
     size = c.shape[-1]
-    ends = np.zeros((2, size))
-    ends[1] = 1.0
-    (at_zero, at_one), _ = slope(ends, c[:, :, None], n, rho)
-    out = np.full(size, 0.5)
-    steep = (at_zero > FLAT) | (at_one < -FLAT)
-    out[steep & (at_zero <= 0.0)] = 0.0
-    out[steep & (at_one >= 0.0)] = 1.0
-    todo = np.flatnonzero(steep & (at_zero > 0.0) & (at_one < 0.0))
-    if len(todo) < size:
-        c = c[..., todo]
-    t, lo, hi = out[todo], np.zeros(len(todo)), np.ones(len(todo))
+    three = np.zeros((3, size))
+    three[1], three[2] = 0.5, 1.0
+    (zero, half, one), _ = slope(three, c[:, :, None], n, rho)
+    steep = (zero > FLAT) | (one < -FLAT)
+    lo, hi = np.where(half > 0.0, 0.5, 0.0), np.where(half > 0.0, 1.0, 0.5)
+    # start where (a + b t) / (1 + c t) through the three values is zero: it can follow a pole
+    t = zero / (zero - one * (1.0 + (zero + one - 2.0 * half) / (half - one)))
+    t = np.where((t >= lo) & (t <= hi), t, 0.5 * (lo + hi))
+    t[~steep] = 0.5
+    t[steep & (zero <= 0.0)] = 0.0
+    t[steep & (one >= 0.0)] = 1.0
+    busy = steep & (zero > 0.0) & (one < 0.0)
+    out, todo = t, np.arange(size)
     for _ in range(ROUNDS):
-        if not len(todo):
-            break
+        left = np.count_nonzero(busy)
+        if left <= 0.6 * len(todo):
+            out[todo] = t
+            if not left:
+                break
+            at = np.flatnonzero(busy)
+            todo, t, lo, hi, c, busy = todo[at], t[at], lo[at], hi[at], c[..., at], busy[at]
         h, dh = slope(t, c, n, rho)
         rising = h > 0.0
-        lo = np.where(rising, t, lo)
-        hi = np.where(rising, hi, t)
+        np.copyto(lo, t, where=rising)
+        np.copyto(hi, t, where=~rising)
         step = h / dh
         new = t - step
         outside = ~((new >= lo) & (new <= hi))
         if outside.any():
             np.copyto(new, 0.5 * (lo + hi), where=outside)
-        out[todo] = new
+        np.copyto(t, new, where=busy)
         gain = h * step  # minus the squared Newton decrement; after this step about its square remains
-        busy = ((gain < -1e-11) | (gain > 0.0) | outside) & (hi - lo > 1e-16)
-        if busy.all():
-            t = new
-        else:
-            left = np.flatnonzero(busy)
-            todo, t, lo, hi, c = todo[left], new[left], lo[left], hi[left], c[..., left]
+        busy &= ((gain < -1e-11) | (gain > 0.0) | outside) & (hi - lo > 1e-16)
+    else:
+        out[todo] = t
     return out

@@ -29,7 +29,8 @@ class Sources:
         worst, least = condition(P, A).max(axis=0), margin.min(axis=0)
         definite = least > 1e-14
         if not definite.all():
-            A[..., ~definite] = np.nan  # stops every iteration at once
+            P = np.where(definite, P, np.nan)  # stops every iteration at once
+            A = np.where(definite, A, np.nan)
         return cls(means.transpose(1, 0, 2), P, A, dets, worst, definite)
 
     @property
@@ -87,8 +88,8 @@ def weighted_product(sources: Sources, scale: FloatArray | None) -> tuple[FloatA
     M, y = np.empty_like(A[:, :, 0]), np.zeros_like(x[:, 0])
     for k in range(len(M)):  # of M the lower triangle is read
         terms = A[k, : k + 1] if scale is None else A[k, : k + 1] * scale
-        M[k, : k + 1] = terms[:, 0]
-        for i in range(1, sources.count):
+        np.add(terms[:, 0], terms[:, 1] if sources.count > 1 else 0.0, out=M[k, : k + 1])
+        for i in range(2, sources.count):
             M[k, : k + 1] += terms[:, i]
     for i in range(1, sources.count):  # x[:, 0] is zero
         term = linalg.matvec(A[:, :, i], x[:, i])
