@@ -48,7 +48,7 @@ def run(targets: int) -> str:
     rng = np.random.default_rng(1)
     side = 2000.0 * np.sqrt(targets)
     states = np.concatenate([rng.uniform(-side, side, (targets, 2)), rng.normal(0, 50, (targets, 2))], axis=1)
-    centre = FusionCentre({})
+    centre = FusionCentre({"sources": {name: {"override": True} for name in ("r1", "r2", "r3")}})
     steps = []
     for second in range(1, 8):
         batch = messages(states, second, rng)

@@ -93,7 +93,7 @@ class Service:
         }
         bus.watch(local_key("*", "alive", realm), self._on_token)
         for what in ("info", "tracks", "intensity"):
-            bus.subscribe(local_key("*", what, realm), self._on_sample, history=8, on_miss=self._on_miss)
+            bus.subscribe(local_key("*", what, realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), lambda _: self._picture)
         bus.answer(global_key(name, "orders", realm), self._on_order)
         bus.announce(global_key(name, "alive", realm))
