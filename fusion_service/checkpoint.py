@@ -22,8 +22,10 @@ if TYPE_CHECKING:
 __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
 
 CHECKPOINT_VERSION = 1
-_PLAIN = ("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered")
-_PLAIN += ("origin", "waited", "highest")
+_PLAIN = (
+    *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
+    *("origin", "waited", "highest"),
+)
 Columns = TypeVar("Columns", Tracks, Picture)
 
 

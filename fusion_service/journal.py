@@ -26,7 +26,7 @@ class Journal:
     """Gathers one step log after the other."""
 
     def __init__(self, name: str, config_hash: str, version: str) -> None:
-        self._fixed = {"source": name, "config_hash": config_hash, "version": version}
+        self._name, self._config_hash, self._version = name, config_hash, version
         self.refused: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
         self.broken: dict[int, int] = {}
@@ -114,6 +114,7 @@ class Journal:
         parts = list(zip(*self._columns, strict=True)) or [[np.zeros(0)]] * len(_DTYPES)
         columns = [np.concatenate(part).astype(dtype) for part, dtype in zip(parts, _DTYPES, strict=True)]
         log = StepLog(
+            source=self._name,
             epoch=epoch,
             seq=seq,
             sent=time,
@@ -125,7 +126,8 @@ class Journal:
             events=tuple(self._events),
             sources=self._sources,
             decisions=Decisions(*columns),
-            **self._fixed,
+            config_hash=self._config_hash,
+            version=self._version,
         )
         self._begin()
         return log
