@@ -111,7 +111,7 @@ class Journal:
 
     def write(self, epoch: int, seq: int, step: int, time: int) -> StepLog:
         """The log of this step; the next one begins empty."""
-        parts = list(zip(*self._columns, strict=True)) or [[np.zeros(0)]] * len(_DTYPES)
+        parts: list[Any] = list(zip(*self._columns, strict=True)) or [[np.zeros(0)]] * len(_DTYPES)
         columns = [np.concatenate(part).astype(dtype) for part, dtype in zip(parts, _DTYPES, strict=True)]
         log = StepLog(
             source=self._name,
