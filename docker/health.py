@@ -1,0 +1,31 @@
+#!/usr/bin/env python
+"""Whether a fusion centre is at work: `centre-health [ENDPOINT [CENTRE [REALM]]]`.
+
+Exit code 0 once a status of the centre has come over the bus, as it does every second; else 1 and one line.
+"""
+
+import sys
+import threading
+
+from fusion_service.bus import DEFAULT_ENDPOINT, BusError, open_bus
+from schemas import global_key
+
+PATIENCE = 3.0
+
+
+def main(endpoint: str = DEFAULT_ENDPOINT, centre: str = "centre", realm: str = "fusion") -> int:
+    """Wait up to `PATIENCE` seconds for the hub at `endpoint`, and as long for a status of `centre`."""
+    status = threading.Event()
+    try:
+        with open_bus([endpoint], wait=PATIENCE) as bus:
+            bus.subscribe(global_key(centre, "status", realm), lambda key, data: status.set(), history=0)
+            if status.wait(PATIENCE):
+                return 0
+        print(f"no status of {centre} within {PATIENCE:g} s")
+    except BusError as error:
+        print(error)
+    return 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main(*sys.argv[1:]))
