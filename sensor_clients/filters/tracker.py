@@ -25,6 +25,8 @@ from sensor_clients.filters.measurement import STATE, Floats, MeasurementModel, 
 
 __all__ = ["LocalTracker", "Report", "TrackerConfig"]
 
+COLUMNS = ("ids", "means", "covariances", "existence", "first", "farthest", "born", "updated", "confirmed")
+
 
 @dataclass(frozen=True, slots=True)
 class TrackerConfig:
@@ -33,8 +35,9 @@ class TrackerConfig:
     confirm, drop: existence at which a track is first reported and at which it ends, for a tentative track
     `drop_tentative`; max_sigma: a track whose position is less certain than this (m, along the worst of
     its axes) ends; merge: squared distance of two tracks, under the sum of their covariances and `extent`^2
-    (m2) on each axis of the place, below which the younger ends: returns of one large target; min_way: a
-    track is reported once it is so far, m, from where it started (0: at once); cubature: CKF, else EKF."""
+    (m2) on each axis of the place, below which the younger ends: returns of one large target; min_way,
+    min_speed: a track is reported once it has been so far, m, from where it started, beyond two standard
+    deviations, and as long as that makes this speed over its age, m/s (0: at once); cubature: CKF, else EKF."""
 
     motion: Motion
     survival: float
@@ -47,6 +50,7 @@ class TrackerConfig:
     merge: float = 0.0
     extent: float = 0.0
     min_way: float = 0.0
+    min_speed: float = 0.0
     cubature: bool = True
 
 
@@ -66,20 +70,24 @@ class Report:
 class LocalTracker:
     """Tracks of one sensor. Not for several threads.
 
-    ids: (T,) i64, never used twice; first (2, T): where each started; means (4, T), covariances (4, 4, T),
-    existence (T,).
+    Columns, one entry per track: ids (T,) i64, never used twice; means (4, T), covariances (4, 4, T),
+    existence (T,); first (2, T): where it started; farthest (T,): how far from there it
+    has been, m, less two standard deviations; born
+    (T,), updated (T,) i64 ns; confirmed (T,).
     """
 
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
         self.time: int | None = None
+        self.ids: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self.means: Floats = np.zeros((4, 0))
         self.covariances: Floats = np.zeros((4, 4, 0))
         self.existence: Floats = np.zeros(0)
-        self.ids: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+        self.first: Floats = np.zeros((2, 0))
+        self.farthest: Floats = np.zeros(0)
+        self.born: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self.updated: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
         self.confirmed: NDArray[np.bool_] = np.zeros(0, dtype=np.bool_)
-        self.first: Floats = np.zeros((2, 0))
         self._next = 1
 
     def predict(self, time: int) -> None:
@@ -104,7 +112,7 @@ class LocalTracker:
         targets at each (M,), per unit of measurement space; `detection` gives the probability (T,) that a
         target at a place (2, T) is seen: 0 outside the field of view, where tracks end.
 
-        Returns the probability (M,) that each return is of no confirmed track."""
+        Returns the probability (M,) that each return is of no reported track."""
         config = self.config
         self.predict(time)
         p = detection(self.means[:2])
@@ -114,17 +122,24 @@ class LocalTracker:
         found = associate(likelihood(prediction, config.gate), self.existence, p, clutter + birth)
         self.means, self.covariances = update(self.means, self.covariances, prediction, found.weights, found.missed)
         self.existence = found.existence
-        reported = np.where(self.confirmed, found.existence, 0.0) @ found.weights
+        claimed = np.where(self.reported(), found.existence, 0.0) @ found.weights
         self.updated = np.where(found.missed < 0.5, time, self.updated)
         self._prune()
         self._start(returns, model, found.unused * birth / (clutter + birth))
-        way = np.hypot(*(self.means[:2] - self.first))
-        self.confirmed = self.confirmed | ((self.existence >= config.confirm) & (way >= config.min_way))
-        return np.asarray(1.0 - reported)
+        way = np.hypot(*(self.means[:2] - self.first)) - 2 * self._worst_sigma()
+        self.farthest = np.maximum(self.farthest, way)
+        self.confirmed = self.confirmed | (self.existence >= config.confirm)
+        return np.asarray(1.0 - claimed)
+
+    def reported(self) -> NDArray[np.bool_]:
+        """Which tracks (T,) are confirmed and on the move."""
+        age = ((self.time or 0) - self.born) * 1e-9
+        way = np.maximum(self.config.min_way, self.config.min_speed * age)
+        return np.asarray(self.confirmed & (self.farthest >= way))
 
     def report(self, time: int | None = None) -> Report:
-        """The confirmed tracks at the time of the last step, or predicted on to `time`, ns."""
-        chosen = self.confirmed
+        """The tracks to report, at the time of the last step, or predicted on to `time`, ns."""
+        chosen = self.reported()
         means, covariances = self.means[:, chosen], self.covariances[..., chosen]
         now = self.time or 0
         if time is not None and time != now:
@@ -147,22 +162,30 @@ class LocalTracker:
         covariances = np.zeros((4, 4, count))
         covariances[:2, :2] = spread
         covariances[2, 2] = covariances[3, 3] = self.config.sigma_speed**2
-        self.means = np.concatenate([self.means, np.concatenate([place, np.zeros((2, count))])], axis=1)
-        self.covariances = np.concatenate([self.covariances, covariances], axis=2)
-        self.existence = np.concatenate([self.existence, existence[chosen]])
-        self.first = np.concatenate([self.first, place], axis=1)
-        self.ids = np.concatenate([self.ids, np.arange(self._next, self._next + count)])
-        self.updated = np.concatenate([self.updated, np.full(count, self.time, dtype=np.int64)])
-        self.confirmed = np.concatenate([self.confirmed, np.zeros(count, dtype=np.bool_)])
+        new = {
+            "ids": np.arange(self._next, self._next + count),
+            "means": np.concatenate([place, np.zeros((2, count))]),
+            "covariances": covariances,
+            "existence": existence[chosen],
+            "first": place,
+            "farthest": np.zeros(count),
+            "born": np.full(count, self.time, dtype=np.int64),
+            "updated": np.full(count, self.time, dtype=np.int64),
+            "confirmed": np.zeros(count, dtype=np.bool_),
+        }
+        for name, values in new.items():
+            setattr(self, name, np.concatenate([getattr(self, name), values], axis=-1))
         self._next += count
+
+    def _worst_sigma(self) -> Floats:
+        """Standard deviation (T,) of the place along its worst axis, m."""
+        P = self.covariances
+        return np.asarray(np.sqrt((P[0, 0] + P[1, 1]) / 2 + np.hypot((P[0, 0] - P[1, 1]) / 2, P[0, 1])))
 
     def _prune(self) -> None:
         config = self.config
-        P = self.covariances
-        half = (P[0, 0] + P[1, 1]) / 2
-        worst = half + np.hypot((P[0, 0] - P[1, 1]) / 2, P[0, 1])
         floor = np.where(self.confirmed, config.drop, config.drop_tentative)
-        self._keep((self.existence >= floor) & (worst <= config.max_sigma**2))
+        self._keep((self.existence >= floor) & (self._worst_sigma() <= config.max_sigma))
         if config.merge and len(self.ids) > 1:
             i, j = np.triu_indices(len(self.ids), 1)
             spread = self.covariances[..., i] + self.covariances[..., j]
@@ -176,7 +199,5 @@ class LocalTracker:
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         if not chosen.all():
-            self.means, self.covariances = self.means[:, chosen], self.covariances[..., chosen]
-            self.first = self.first[:, chosen]
-            self.existence, self.ids = self.existence[chosen], self.ids[chosen]
-            self.updated, self.confirmed = self.updated[chosen], self.confirmed[chosen]
+            for name in COLUMNS:
+                setattr(self, name, getattr(self, name)[..., chosen])

@@ -93,7 +93,8 @@ LIDAR = HarbourSensor(
         max_sigma=12.0,
         merge=5.0,
         extent=13.0,
-        min_way=12.0,
+        min_way=6.0,
+        min_speed=0.5,
     ),
 )
 
@@ -125,10 +126,11 @@ RADAR = HarbourSensor(
         confirm=0.95,
         drop=0.3,
         drop_tentative=0.005,
-        max_sigma=5.0,
+        max_sigma=6.0,
         merge=1.0,
         extent=15.0,
-        min_way=12.0,
+        min_way=6.0,
+        min_speed=0.5,
     ),
 )
 
