@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 from .. import linalg
 from ..linalg import FloatArray, inner, total
 from . import pairs, simplex
-from .sources import Result, Sources, condition
+from .sources import Result, Sources, condition, weighted_mean, weighted_sum
 
 
 def hmd_ga(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str, constants: bool) -> Result:
@@ -61,10 +61,10 @@ def hmd_ga(sources: Sources, weights: FloatArray | None, influence: bool, *, cri
     G, D = mixture(v)
     V = linalg.inverse(G)
     A = sources.information
-    everything = total(A.transpose(2, 0, 1, 3))
+    everything = weighted_sum(A)
     M = everything - V
     P = linalg.inverse(M)
-    y = total(linalg.matvec(A, sources.spread).swapaxes(0, 1)) - linalg.matvec(V, mixture.mean(v))
+    y = weighted_mean(sources) - linalg.matvec(V, mixture.mean(v))
     # M is a difference: what is lost in it is tr(P sum P_i^-1) / n >= 1
     worst = np.maximum(worst, condition(G, V)) * inner(P, everything) / len(P)
     gap = np.zeros_like(worst)
@@ -93,7 +93,7 @@ class Mixture:
     def __call__(self, v: FloatArray) -> tuple[FloatArray, FloatArray]:
         r = self.c - self.mean(v)[:, None]
         D = self.C + linalg.outer(r, r)
-        return total((D * v).transpose(2, 0, 1, 3)), D
+        return weighted_sum(D, v), D
 
     def bend(self, v: FloatArray, G: FloatArray) -> FloatArray:
         r = self.c - self.mean(v)[:, None]

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from .. import linalg
 from ..linalg import FloatArray, inner
 from . import pairs, simplex
-from .sources import Result, Sources, weighted_product
+from .sources import Result, Sources, weighted_product, weighted_sum
 
 
 def ci(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:
@@ -103,7 +103,7 @@ class Inflated:
 
     def __call__(self, w: FloatArray) -> tuple[FloatArray, FloatArray]:
         c, slope, _ = self.scale(w)
-        return _sum(self.A * c), self.A * slope
+        return weighted_sum(self.A, c), self.A * slope
 
     def bend(self, w: FloatArray, G: FloatArray) -> FloatArray | None:
         if self.rho == 1.0:
@@ -129,16 +129,11 @@ class Coupled:
         crowd = self.crowd(w)
         own = self.A / crowd
         pull = own * (w / crowd)
-        others = np.stack([_sum(pull * self.R[:, j, None]) for j in range(len(w))], axis=2)
-        return _sum(own * w), own - others
+        others = np.stack([weighted_sum(pull, self.R[:, j, None]) for j in range(len(w))], axis=2)
+        return weighted_sum(own, w), own - others
 
     def bend(self, w: FloatArray, G: FloatArray) -> None:
         return None
 
     def take(self, index: NDArray[np.bool_]) -> Self:
         return replace(self, A=self.A[..., index])
-
-
-def _sum(A: FloatArray) -> FloatArray:
-    """Over the sources: (n, n, N, B) -> (n, n, B)."""
-    return linalg.total(A.transpose(2, 0, 1, 3))

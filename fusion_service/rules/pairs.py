@@ -18,9 +18,10 @@ from .. import linalg
 from ..linalg import FloatArray
 
 LIMIT = 6
-ROUNDS = 80
+ROUNDS = 60
 FLAT = 1e-10
 """Relative slope below which a criterion does not care: the weight stays at a half."""
+DONE = 1e-11
 
 
 Ends = tuple[FloatArray, FloatArray]
@@ -63,24 +64,25 @@ def _nodes(degree: int) -> tuple[FloatArray, FloatArray]:
     return 0.5 + 0.5 * z, np.linalg.inv(np.vander(z, increasing=True))
 
 
-def _polynomials(t: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Values, first and second derivatives by t of polynomials c (degree + 1, k, B) in 2t - 1: (k, B) each."""
+def _with_derivatives(c: FloatArray) -> FloatArray:
+    """(degree + 1, 3, k, B): coefficients of polynomials in z = 2t - 1 and of their two derivatives by t."""
+    out = np.zeros((len(c), 3, *c.shape[1:]))
+    power = 2.0 * np.arange(1, len(c))[:, None, None]
+    out[:, 0] = c
+    np.multiply(power, c[1:], out=out[:-1, 1])
+    np.multiply(power[:-1], out[1:-1, 1], out=out[:-2, 2])
+    return out
+
+
+def _polynomials(t: FloatArray, c: FloatArray) -> FloatArray:
+    """Values, first and second derivatives, (3, k, B), from `_with_derivatives`."""
     z = t + t - 1.0
-    f = c[-1] * z
-    f += c[-2]
-    df: FloatArray = np.zeros_like(f)
-    df += c[-1]
-    ddf: FloatArray = np.zeros_like(f)
-    for k in range(len(c) - 3, -1, -1):
-        ddf *= z
-        ddf += df
-        df *= z
-        df += f
-        f *= z
-        f += c[k]
-    df *= 2.0
-    ddf *= 8.0
-    return f, df, ddf
+    out: FloatArray = c[-1] * z
+    out += c[-2]
+    for row in c[-3::-1]:
+        out *= z
+        out += row
+    return out
 
 
 def _share(t: FloatArray, rho: float) -> tuple[FloatArray, ...]:
@@ -142,7 +144,8 @@ def _newton(slope: Slope, to_coefficients: FloatArray, values: FloatArray, n: in
     size = c.shape[-1]
     three = np.zeros((3, size))
     three[1], three[2] = 0.5, 1.0
-    (zero, half, one), _ = slope(three, c[:, :, None], n, rho)
+    c = _with_derivatives(c)
+    (zero, half, one), _ = slope(three, c[..., None, :], n, rho)
     steep = (zero > FLAT) | (one < -FLAT)
     lo, hi = np.where(half > 0.0, 0.5, 0.0), np.where(half > 0.0, 1.0, 0.5)
     # start where (a + b t) / (1 + c t) through the three values is zero: it can follow a pole
@@ -171,8 +174,8 @@ def _newton(slope: Slope, to_coefficients: FloatArray, values: FloatArray, n: in
         if outside.any():
             np.copyto(new, 0.5 * (lo + hi), where=outside)
         np.copyto(t, new, where=busy)
-        gain = h * step  # minus the squared Newton decrement; after this step about its square remains
-        busy &= ((gain < -1e-11) | (gain > 0.0) | outside) & (hi - lo > 1e-16)
+        # h step is minus the squared Newton decrement: after this step about its square remains
+        busy &= ~(np.abs(h * step + 0.5 * DONE) <= 0.5 * DONE) | outside
     else:
         out[todo] = t
     return out

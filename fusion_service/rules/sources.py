@@ -78,22 +78,33 @@ def condition(P: FloatArray, A: FloatArray) -> FloatArray:
     return out
 
 
+def weighted_sum(A: FloatArray, scale: FloatArray | None = None) -> FloatArray:
+    """sum_i scale_i A_i (n, n, B) of A (n, n, N, B): the lower triangle, which is all that is read of it."""
+    M = np.empty_like(A[:, :, 0])
+    for k in range(len(M)):
+        terms = A[k, : k + 1] if scale is None else A[k, : k + 1] * scale
+        np.add(terms[:, 0], terms[:, 1] if A.shape[2] > 1 else 0.0, out=M[k, : k + 1])
+        for i in range(2, A.shape[2]):
+            M[k, : k + 1] += terms[:, i]
+    return M
+
+
+def weighted_mean(sources: Sources, scale: FloatArray | None = None) -> FloatArray:
+    """sum_i scale_i P_i^-1 (x_i - x_0), (n, B)."""
+    A, x = sources.information, sources.spread
+    y = np.zeros_like(x[:, 0])
+    for i in range(1, sources.count):
+        term = linalg.matvec(A[:, :, i], x[:, i])
+        y += term if scale is None else term * scale[i]
+    return y
+
+
 def weighted_product(sources: Sources, scale: FloatArray | None) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Mean, covariance and condition of the product of N(x_i, P_i / scale_i): P^-1 = sum scale_i P_i^-1.
 
     `scale` (N, B), or None for ones.
     """
-    x = sources.spread
-    A = sources.information
-    M, y = np.empty_like(A[:, :, 0]), np.zeros_like(x[:, 0])
-    for k in range(len(M)):  # of M the lower triangle is read
-        terms = A[k, : k + 1] if scale is None else A[k, : k + 1] * scale
-        np.add(terms[:, 0], terms[:, 1] if sources.count > 1 else 0.0, out=M[k, : k + 1])
-        for i in range(2, sources.count):
-            M[k, : k + 1] += terms[:, i]
-    for i in range(1, sources.count):  # x[:, 0] is zero
-        term = linalg.matvec(A[:, :, i], x[:, i])
-        y += term if scale is None else term * scale[i]
+    M = weighted_sum(sources.information, scale)
     P = linalg.inverse(M)
-    mean = sources.means[:, 0] + linalg.matvec(P, y)
+    mean = sources.means[:, 0] + linalg.matvec(P, weighted_mean(sources, scale))
     return mean, P, np.maximum(sources.condition, condition(M, P))
