@@ -132,10 +132,9 @@ def _factor(P: FloatArray, det: FloatArray, margin: FloatArray) -> tuple[FloatAr
     A = np.empty(P.shape, P.dtype)
     W = np.empty(P.shape, P.dtype)  # holds -L first
     r = np.empty(P.shape[1:], P.dtype)
-    for i in range(n):
-        A[i, : i + 1] = P[i, : i + 1]
     for k in range(n):
-        d = A[k, k]
+        S = A if k else P
+        d = S[k, k]
         if k:
             det *= d
             np.minimum(margin, d / np.abs(P[k, k]), out=margin)
@@ -143,9 +142,9 @@ def _factor(P: FloatArray, det: FloatArray, margin: FloatArray) -> tuple[FloatAr
             det[...] = d
             margin[...] = d / np.abs(d)
         np.divide(1.0, d, out=r[k])
-        np.multiply(A[k + 1 :, k], -r[k], out=W[k + 1 :, k])
+        np.multiply(S[k + 1 :, k], -r[k], out=W[k + 1 :, k])
         for i in range(k + 1, n):
-            A[i, k + 1 : i + 1] += W[i, k] * A[k + 1 : i + 1, k]
+            np.add(S[i, k + 1 : i + 1], W[i, k] * S[k + 1 : i + 1, k], out=A[i, k + 1 : i + 1])
     for i in range(2, n):
         row = W[i, :i].copy()
         for k in range(1, i):
@@ -183,15 +182,16 @@ def ldl(P: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _pivots(P: FloatArray) -> FloatArray:
-    n = P.shape[0]
-    A = np.array(P)
+    n = len(P)
+    A = np.empty(P.shape, P.dtype)
     d = np.empty(P.shape[1:], P.dtype)
     for k in range(n):
-        d[k] = A[k, k]
+        S = A if k else P
+        d[k] = S[k, k]
         if k + 1 < n:
-            pivot = 1.0 / d[k]
+            minus = -1.0 / d[k]
             for i in range(k + 1, n):
-                A[i, k + 1 : i + 1] -= (A[i, k] * pivot) * A[k + 1 : i + 1, k]
+                np.add(S[i, k + 1 : i + 1], (S[i, k] * minus) * S[k + 1 : i + 1, k], out=A[i, k + 1 : i + 1])
     return d
 
 
