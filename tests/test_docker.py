@@ -25,7 +25,6 @@ ROOT = Path(__file__).parents[1]
 DOCKER = ROOT / "docker"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 PARSERS = {"fusion-service": cli._parser(), "sensor-client": client_cli._parser()}
-COMMANDS = [sys.executable, "-W", "error", "-m"]
 
 
 def parse_yaml(text: str) -> Any:
@@ -72,10 +71,11 @@ CLIENTS = {name: one for name, one in SERVICES.items() if one["command"].startsw
 
 
 def command(name: str, environment: dict[str, str]) -> list[str]:
-    """A service's command as Compose makes it: ${NAME:-default}, ${NAME:+replacement} and $NAME, then words."""
-    text = re.sub(r"\$\{(\w+):-([^}]*)\}", lambda m: environment.get(m[1]) or m[2], SERVICES[name]["command"])
-    text = re.sub(r"\$\{(\w+):\+([^}]*)\}", lambda m: m[2] if environment.get(m[1]) else "", text)
-    return shlex.split(re.sub(r"\$(\w+)", lambda m: environment[m[1]], text))
+    """A service's command as Compose makes it: ${NAME:-default}, ${NAME:+replacement}, then words."""
+    text = re.sub(r"\$\{(\w+):-([^{}]*)\}", lambda m: environment.get(m[1]) or m[2], SERVICES[name]["command"])
+    text = re.sub(r"\$\{(\w+):\+([^{}]*)\}", lambda m: m[2] if environment.get(m[1]) else "", text)
+    assert "$" not in text
+    return shlex.split(text)
 
 
 def arguments(name: str, **environment: str) -> Any:
@@ -165,7 +165,8 @@ def test_health_follows_the_service(hub: Hub, tmp_path: Path) -> None:
         return done.returncode, done.stdout
 
     assert health() == (1, "no status of centre within 3 s\n")
-    service = subprocess.Popen([*COMMANDS, "fusion_service", "run", "--config", str(config)], stderr=subprocess.DEVNULL)
+    run = [sys.executable, "-m", "fusion_service", "run", "--config", str(config)]
+    service = subprocess.Popen(run, stderr=subprocess.DEVNULL)
     try:
         code, said = health()
         while code and "no status" in said and service.poll() is None:
