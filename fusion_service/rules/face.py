@@ -3,7 +3,8 @@
 Every fusion is computed in float64. Where the matrices inverted on the way are so ill-conditioned that
 the result could be wrong by more than about 1e-8, or weights cannot be certified as optimal, that one
 fusion is computed again in longdouble; where even this could be wrong by more than 1e-6 it is refused.
-Weights are within 1e-9 of the best value of their criterion, or, in longdouble, as near as rounding shows.
+Weights are within 1e-9 of the best value of their criterion; of a fusion in longdouble rounding can hide
+that, and 1e-6 is enough there.
 (Where longdouble is no wider than double, everything that needs it is refused.)
 """
 
@@ -27,6 +28,8 @@ from .sources import Result, Sources
 FAST_CONDITION = 1e7
 SAFE_CONDITION = 4e12 if np.finfo(np.longdouble).eps < 2e-19 else 0.0
 """Largest condition (see `sources.condition`) accepted in float64 and in longdouble."""
+SAFE_GAP = 1e-6
+"""Optimality gap of the weights that is accepted in longdouble."""
 CRITERIA = ("det", "trace")
 
 
@@ -201,9 +204,8 @@ def _run(
         sources = Sources.of(means, covariances)
         result = function(sources, weights, influence, **chosen)
         limit = FAST_CONDITION if sources.fast else SAFE_CONDITION
-        # a gap is seen no finer than rounding lets it be: that matters in longdouble only
-        visible = GAP if sources.fast else GAP + 64.0 * np.finfo(np.longdouble).eps * result.condition
-        doubtful = ~((result.condition <= limit) & (result.gap <= visible) & sources.definite)
+        enough = GAP if sources.fast else SAFE_GAP
+        doubtful = ~((result.condition <= limit) & (result.gap <= enough) & sources.definite)
         if not doubtful.any():
             return result
         share = None if result.influence is None else np.array(result.influence)

@@ -73,16 +73,16 @@ def best_weights(criterion: str, model: Model, start: FloatArray) -> FloatArray:
     s = g - g.min(axis=0) + np.maximum(gap(w, g), 1e-3)
     centring = np.full(size, 0.1, start.dtype)
     for _ in range(ROUNDS):
-        product_ws = total(w * s) / N
+        target = np.maximum(total(w * s) / N, 1e-13)
         best[:, todo], slack[:, todo] = w, s
-        busy = (gap(w, g) > 0.01 * GAP) & (product_ws > 1e-15)
+        busy = gap(w, g) > 0.01 * GAP
         if not busy.all():
             todo, active = todo[busy], active.take(busy)
             w, s, g, V, D = w[:, busy], s[:, busy], g[:, busy], V[..., busy], D[..., busy]
-            value, centring, product_ws = value[busy], centring[busy], product_ws[busy]
+            value, centring, target = value[busy], centring[busy], target[busy]
         if not len(todo):
             break
-        mu = centring * product_ws
+        mu = centring * target
         dw = _direction(_hessian(criterion, active, w, V, D) + diagonal(s / w), g - mu / w)
         ds = mu / w - s - (s / w) * dw
         step, dual = _room(w, dw), _room(s, ds)

@@ -235,6 +235,22 @@ def test_hard_input_is_right_or_refused(rule: str, criterion: str) -> None:
     assert done[True] >= 40
 
 
+@pytest.mark.parametrize(("N", "n"), [(2, 1), (3, 1), (6, 2), (3, 4), (2, 7)])
+def test_variances_decades_apart_are_no_reason_to_refuse(N: int, n: int) -> None:
+    """Here the weights have optima at 1e-3 and 1e-8: they are found, and no worse than many others."""
+    rng = np.random.default_rng(SEED)
+    x, P = batch(rng, 10, N, n, decades=8.0)
+    A = np.linalg.inv(P)
+    for rho in (1.0, 0.3, 1e-6):
+        fused = fuse("bci", x, P, max_correlation=rho, criterion="trace")
+        best = np.trace(fused.covariance, axis1=1, axis2=2)
+        near = fused.weights * np.exp(rng.normal(size=(100, 1, N)) * 0.1)
+        far = np.broadcast_to(rng.dirichlet(np.full(N, 0.3), size=(100, 1)), near.shape)
+        for w in (*(near / near.sum(axis=-1, keepdims=True)), *far):
+            M = np.einsum("bi,bijk->bjk", w / ((1 - rho) * w + rho), A)
+            assert (best <= np.trace(np.linalg.inv(M), axis1=1, axis2=2) * (1 + 1e-6)).all()
+
+
 def test_means_far_from_the_origin_cost_nothing() -> None:
     """Earth-centred coordinates: six million metres, centimetres of difference."""
     x, P = sources(np.random.default_rng(SEED), 2, 3, 1.0)
