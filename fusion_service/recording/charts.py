@@ -31,7 +31,8 @@ class Charts:
     def local(self, message: LocalTracks | LocalIntensity, colours: dict[str, palette.Colour], stamp: Stamp) -> None:
         count = len(message.ids) if isinstance(message, LocalTracks) else float(message.weights.sum())
         path = entity("counts", "local", message.source)
-        self._add(path, stamp, count, colours[message.source], message.source)
+        tone = colours.get(message.source, palette.NEUTRAL)
+        self._add(path, stamp, count, tone, message.source)
 
     def step(self, message: GlobalTracks, colours: dict[str, palette.Colour], stamp: Stamp) -> None:
         centre = message.source

@@ -32,6 +32,8 @@ U64 = NDArray[np.uint64]
 TENTATIVE, COASTING = STATUSES.index("tentative"), STATUSES.index("coasting")
 ALPHA = np.array([90, 255, 170])
 """Of tentative, confirmed and coasting tracks."""
+ABOVE = 25.0
+"""Draw order of the trails of truth: over other lines (20), under points (30)."""
 INTENSITY = 0.1
 """Components of an intensity that expect less than this are not drawn."""
 DEFAULT_PERIOD = 10.0
@@ -63,10 +65,11 @@ class Drawing:
         self.chart: Chart | None = None if frame is None else Chart(frame)
         self.trails: list[str] = []
         self.sources: dict[str, str] = {}
+        self.colours: dict[str, palette.Colour] = {}
         self.changed = True
         self._generations: dict[int, int] = {}
         self._tables: dict[str, _Table] = {}
-        self._styled: set[str] = set()
+        self._recolour = False
         self._info: dict[str, SensorInfo] = {}
         self._extents: dict[bool, tuple[Floats, Floats]] = {}
         self._grid: tuple[Floats, Floats] | None = None
@@ -93,10 +96,6 @@ class Drawing:
         """South-west and north-east corner (2,) of what is drawn in m: sensors, global tracks and truth, or else
         the local tracks."""
         return self._extents.get(True) or self._extents.get(False)
-
-    def colours(self) -> dict[str, palette.Colour]:
-        """By name of each source seen until now."""
-        return palette.source_colours(self.sources)
 
     def sensor(self, info: SensorInfo, stamp: Stamp) -> None:
         """Position, name and field of view, once and whenever they change."""
@@ -147,7 +146,8 @@ class Drawing:
         table = _table(message.epoch, message.time, message.ids[sound], place, message.status[sound])
         self._grow(table.place.xy, main=True)
         path = entity("picture", "global", message.source)
-        self._style(path, palette.FUSED, radius=4.5, width=1.5, alpha=255, labels=True)
+        if self._first(path):
+            self._style(path, palette.FUSED, radius=4.5, width=1.5, alpha=255, labels=True)
         table = self._trail(path, table, 0, stamp)
         labels = [self.label(track) for track in table.ids.tolist()]
         colours = palette.packed(palette.FUSED, 0) + ALPHA.astype(np.uint32)[table.codes]
@@ -160,7 +160,8 @@ class Drawing:
         table = _table(message.epoch, message.time, message.ids, place, np.ones(len(message.ids), dtype=np.uint8))
         self._grow(table.place.xy, main=True)
         path = entity("picture", "truth", message.source)
-        self._style(path, palette.TRUTH, radius=2.5, width=1.0, alpha=200, labels=False)
+        if self._first(path):
+            self._style(path, palette.TRUTH, radius=2.5, width=1.0, alpha=200, labels=False, order=ABOVE)
         table = self._trail(path, table, 0, stamp)
         self._columns.points(path, stamp, self._points(table.place, [f"target {track}" for track in table.ids]))
 
@@ -210,15 +211,32 @@ class Drawing:
         return new
 
     def _source(self, name: str) -> None:
-        if name in self.sources:
+        if name not in self.sources:
+            self.sources[name] = entity("picture", "local", name)
+            self.trails.append(f"{self.sources[name]}/trail")
+            self.changed = self._recolour = True
+
+    def _first(self, path: str) -> bool:
+        """Whether an entity with a trail is new."""
+        if f"{path}/trail" in self.trails:
+            return False
+        self.trails.append(f"{path}/trail")
+        self.changed = True
+        return True
+
+    def colour_sources(self) -> None:
+        """Give each source its colour; a new one may change those of others."""
+        if not self._recolour:
             return
-        self.sources[name] = entity("picture", "local", name)
-        for other, colour in self.colours().items():
-            self._style(self.sources[other], colour, radius=2.5, width=0.75, alpha=130, labels=False, again=True)
-            path = entity("picture", "sensors", other)
-            rr, tone = self._rr, palette.packed(colour)
-            self._columns.static(path, *_both(rr, "Points", colors=[tone], radii=[-6.0]))
-            edge = _both(rr, "Lines", colors=[palette.packed(colour, 110)], radii=[-0.75])
+        self._recolour = False
+        for name, colour in palette.source_colours(self.sources).items():
+            if self.colours.get(name) == colour:
+                continue
+            self.colours[name] = colour
+            self._style(self.sources[name], colour, radius=2.5, width=0.75, alpha=130, labels=False)
+            path = entity("picture", "sensors", name)
+            self._columns.static(path, *_both(self._rr, "Points", colors=[palette.packed(colour)], radii=[-6.0]))
+            edge = _both(self._rr, "Lines", colors=[palette.packed(colour, 110)], radii=[-0.75])
             self._columns.static(f"{path}/coverage", *edge)
 
     def _style(
@@ -230,21 +248,16 @@ class Drawing:
         width: float,
         alpha: int,
         labels: bool,
-        again: bool = False,
+        order: float = 20.0,
     ) -> None:
         """What all rows of an entity, its ellipses and its trail share; sizes in points of the screen."""
-        if path in self._styled and not again:
-            return
-        if path not in self._styled:
-            self.trails.append(f"{path}/trail")
-            self.changed = True
-        self._styled.add(path)
         rr, static = self._rr, self._columns.static
         static(path, *_both(rr, "Points", colors=[palette.packed(colour)], radii=[-radius]))
         static(path, rr.Points2D.from_fields(show_labels=labels))
         faint = palette.packed(colour, alpha)
         static(f"{path}/ellipses", *_both(rr, "Lines", colors=[faint], radii=[-width]))
-        static(f"{path}/trail", *_both(rr, "Lines", colors=[faint], radii=[-width]))
+        static(f"{path}/trail", *_both(rr, "Lines", colors=[faint], radii=[-0.75 * width]))
+        static(f"{path}/trail", rr.LineStrips2D.from_fields(draw_order=order))
 
     def _grow(self, xy: Floats, *, main: bool) -> None:
         """Let the extent hold `xy` (T, 2); the grid and the view follow in steps."""

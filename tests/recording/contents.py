@@ -1,4 +1,4 @@
-"""What a recording holds, read with Rerun itself."""
+"""Making a recording of a few messages, and what one holds, read with Rerun itself."""
 
 from __future__ import annotations
 
@@ -7,6 +7,12 @@ from pathlib import Path
 from typing import Any
 
 from rerun.chunk import RrdReader
+
+from fusion_service.recording import Recorder
+from schemas import Message, encode, global_key, local_key, truth_key
+
+FIRST = 1_790_000_000 * 10**9
+"""Receive time of the first message that `record` hands over, ns; the others follow a nanosecond apart."""
 
 
 def rows(path: Path, entity: str) -> list[dict[str, Any]]:
@@ -36,3 +42,24 @@ def row(path: Path, entity: str, time: int) -> dict[str, Any]:
 
 def entities(path: Path) -> set[str]:
     return {chunk.entity_path for chunk in RrdReader(path).stream()}
+
+
+def key_of(message: Message) -> str:
+    return {
+        "local_tracks": lambda: local_key(message.source, "tracks"),
+        "local_intensity": lambda: local_key(message.source, "intensity"),
+        "sensor_info": lambda: local_key(message.source, "info"),
+        "global_tracks": lambda: global_key(message.source, "tracks"),
+        "truth": lambda: truth_key(message.source),
+    }[message.type]()
+
+
+def record(path: Path, *said: Message, **options: Any) -> Recorder:
+    with Recorder(path, **options) as recorder:
+        for number, message in enumerate(said):
+            recorder.handle(key_of(message), encode(message), FIRST + number)
+    return recorder
+
+
+def texts(path: Path, about: str) -> list[str]:
+    return [said["TextLog:text"][0] for said in rows(path, f"/log/{about}")]
