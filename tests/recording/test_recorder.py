@@ -12,13 +12,13 @@ import missions
 import numpy as np
 import pytest
 from processes import Hub, Program
-from recording.contents import key_of, rows, texts
+from recording.contents import entities, key_of, record, rows, texts
 from recording.mission import START, Sent, mission
 from rerun.chunk import RrdReader
 
 from fusion_service.bus import open_bus
 from fusion_service.recording import RawMessage, Recorder, default_path, messages, read
-from schemas import encode, local_key
+from schemas import Message, encode, local_key
 
 SECOND = 10**9
 
