@@ -54,11 +54,16 @@ class MessageClock:
         self._next: int | None = None
         self._claimed: dict[str, int] = {}
         self._newest: dict[str, int] = {}
+        self._epoch: dict[str, int] = {}
         self._token: dict[str, bool] = {}
         self._times: list[int] = []
 
-    def observe(self, source: str, time: int) -> bool:
-        """A message of `source` holds at `time`, ns. False: too far ahead of all others, refuse it."""
+    def observe(self, source: str, epoch: int, time: int) -> bool:
+        """A message of this run of `source` holds at `time`, ns. False: too far ahead of all others, refuse it."""
+        if epoch > self._epoch.get(source, -1):
+            self._epoch[source] = epoch
+            self._claimed.pop(source, None)
+            self._newest.pop(source, None)
         others = [claimed for name, claimed in self._claimed.items() if name != source and self._is_live(name)]
         self._claimed[source] = max(time, self._claimed.get(source, time))
         if others and time > max(others) + self._lead:

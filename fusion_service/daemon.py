@@ -33,6 +33,8 @@ __all__ = ["run_service"]
 log = logging.getLogger(__name__)
 
 MAX_NAMES = 4096
+MAX_FAILURES = 2
+"""Steps in a row that may fail before the checkpoint is given up too."""
 
 
 class Arrival(NamedTuple):
@@ -72,6 +74,8 @@ class Service:
         self._result: StepResult | None = None
         self._picture = b""
         self._statuses = 0
+        self._failures = 0
+        self._behind = float("-inf")
         self._started = time.monotonic()
 
     def _make_centre(self) -> FusionCentre:
@@ -171,16 +175,18 @@ class Service:
         elif (
             self._message_clock is not None
             and isinstance(message, (LocalTracks, LocalIntensity))
-            and not self._observe(name, message.time, item.received)
+            and not self._observe(message, item.received)
         ):
             self._centre.handle(Refused(name, "future"), item.received)
         else:
             self._centre.handle(message, item.received)
 
-    def _observe(self, name: str, at: int, received: int) -> bool:
+    def _observe(self, message: LocalTracks | LocalIntensity, received: int) -> bool:
         assert self._message_clock is not None
         horizon = received + round(self._config.centre.max_future * 1e9)
-        return at <= horizon and self._message_clock.observe(name, at)
+        if max(message.time, message.epoch) > horizon:
+            return False
+        return self._message_clock.observe(message.source, message.epoch, message.time)
 
     def _note_tokens(self) -> bool:
         """Tell the centre which sources came and went; whether any did."""
@@ -208,6 +214,20 @@ class Service:
                 return
             if due > self._centre.time:
                 self._step(due)
+            else:
+                self._warn_behind(due)
+
+    def _warn_behind(self, due: int) -> None:
+        """The messages' time is before the checkpoint's: no step can be made there again."""
+        self._counts["behind"] += 1
+        if time.monotonic() - self._behind > 10.0:
+            self._behind = time.monotonic()
+            log.warning(
+                "the messages are %.0f s before the last step of the checkpoint: to begin a mission anew, "
+                "stop the service and delete the folder %s",
+                (self._centre.time - due) / 1e9,
+                self._config.service.state,
+            )
 
     def _step(self, at: int) -> None:
         begin = time.perf_counter()
@@ -218,10 +238,16 @@ class Service:
             sent = time.time_ns()
             picture, journal = (encode(dataclasses.replace(part, sent=sent)) for part in (result.tracks, result.log))
         except Exception:
-            log.exception("the step at %d failed: going on from the last checkpoint", at)
             self._counts["failed_steps"] += 1
+            self._failures += 1
+            if self._failures > MAX_FAILURES:
+                self._blob = None
+            log.exception(
+                "the step at %d failed: going on from %s", at, "the last checkpoint" if self._blob else "nothing"
+            )
             self._centre = self._make_centre()
             return
+        self._failures = 0
         self._result = result
         seconds = time.perf_counter() - begin
         self._counts["steps"] += 1
@@ -275,6 +301,7 @@ class Service:
                 "mean": self._step_seconds["total"] / steps,
                 "failed": float(counts["failed_steps"]),
                 "skipped": float(self._wall_clock.skipped),
+                "behind": float(counts["behind"]),
             },
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         )

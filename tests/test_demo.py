@@ -9,9 +9,11 @@ import signal
 import time
 from pathlib import Path
 
+import fuse_again
 import pytest
 from processes import Program, eventually
 
+from fusion_service.config import load_config
 from fusion_service.recording import messages
 from schemas import GlobalTracks, StepLog, Truth
 
@@ -64,6 +66,9 @@ def test_three_radars_from_start_to_score(tmp_path: Path) -> None:
     logs = [message for message in recorded if isinstance(message, StepLog)]
     assert len(pictures) == len(logs) == 31
     assert any(isinstance(message, Truth) for message in recorded)
+    pairs = fuse_again.again(load_config(out / "centre.toml").centre, recorded)
+    assert len(pairs) == 31
+    assert fuse_again.differing(pairs) == []
 
 
 def test_ctrl_c_in_the_middle_ends_everything_and_the_recording_opens(tmp_path: Path) -> None:

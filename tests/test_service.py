@@ -291,6 +291,52 @@ def test_by_message_time_it_steps_when_all_live_sources_have_passed(hub: Hub, tm
         assert times() == pytest.approx([*np.arange(0.4, 1.01, 0.2)])
 
 
+def test_a_step_that_fails_does_not_end_the_service(
+    scene: Scene, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    from fusion_service.centre import FusionCentre
+    from fusion_service.config import load_config
+    from fusion_service.daemon import Service
+    from fusion_service.state import open_state
+
+    broken = {"checkpoint": False, "steps": 0}
+    make, real = FusionCentre.__init__, FusionCentre.step
+
+    def step(centre: FusionCentre, at: int) -> object:
+        if broken["checkpoint"] and centre.restored:  # type: ignore[attr-defined]
+            broken["steps"] += 1
+            raise RuntimeError("a fault of ours")
+        return real(centre, at)
+
+    def init(centre: FusionCentre, config: object, checkpoint: bytes | None = None, **rest: object) -> None:
+        make(centre, config, checkpoint, **rest)  # type: ignore[arg-type]
+        centre.restored = checkpoint is not None  # type: ignore[attr-defined]
+
+    monkeypatch.setattr(FusionCentre, "__init__", init)
+    monkeypatch.setattr(FusionCentre, "step", step)
+    path = scene.folder / "centre.toml"
+    path.write_text(CONFIG.format(centre="", endpoint=scene.endpoint, state=scene.folder / "state"))
+    stop = threading.Event()
+    with open_state(str(scene.folder / "state")) as state, open_bus([scene.endpoint], wait=10.0) as bus:
+        service = Service(load_config(path), bus, state)
+        service._centre.restored = True  # type: ignore[attr-defined]
+        thread = threading.Thread(target=service.run, args=(stop,))
+        thread.start()
+        try:
+            scene.sensor("r1", 0, 1)
+            eventually(scene.seen.sees(0, 1), 15)
+            before = set(scene.seen.born())
+            broken["checkpoint"] = True
+            eventually(lambda: broken["steps"] == 3)
+            eventually(lambda: scene.last_status().step_time["failed"] == 3)
+            eventually(lambda: scene.seen.sees(0, 1)() and not before & set(scene.seen.confirmed().values()))
+        finally:
+            stop.set()
+            thread.join(5)
+    assert not thread.is_alive()
+    assert "a fault of ours" in caplog.text
+
+
 def test_ctrl_c_ends_everything_at_once(tmp_path: Path) -> None:
     endpoint = free_endpoint()
     config = tmp_path / "centre.toml"

@@ -21,8 +21,8 @@ def drain(of: MessageClock) -> list[float]:
     return out
 
 
-def see(of: MessageClock, source: str, at: float) -> bool:
-    return of.observe(source, START + round(at * SECOND))
+def see(of: MessageClock, source: str, at: float, epoch: int = 1) -> bool:
+    return of.observe(source, epoch, START + round(at * SECOND))
 
 
 def test_steps_when_every_live_source_has_reached_them() -> None:
@@ -56,6 +56,19 @@ def test_a_lost_source_is_not_waited_for() -> None:
     assert drain(one) == []
     one.presence("b", False)
     assert drain(one) == [2.0]
+
+
+def test_a_restarted_source_is_waited_for_from_where_it_is_now() -> None:
+    one = clock()
+    for name in ("a", "b"):
+        one.presence(name, True)
+        see(one, name, 5.0)
+    assert drain(one) == [5.0]
+    see(one, "b", 3.0, epoch=2)
+    see(one, "a", 6.0)
+    assert drain(one) == []
+    see(one, "b", 6.0, epoch=2)
+    assert drain(one) == [6.0]
 
 
 def test_one_that_runs_far_ahead_is_not_followed_until_another_is_there() -> None:
