@@ -52,16 +52,11 @@ def read(path: str | Path) -> Iterator[RawMessage]:
         for chunk in _open(path, Path(folder)).stream().filter(content="/raw/**"):
             for message in _rows(chunk):
                 heapq.heappush(waiting, message)
-            while waiting and waiting[0].arrival <= following:
-                message = heapq.heappop(waiting)
-                if message.arrival == following:
-                    yield message
-                    following += 1
-        while waiting:
-            message = heapq.heappop(waiting)
-            if message.arrival >= following:
-                yield message
-                following = message.arrival + 1
+            while waiting and waiting[0].arrival == following:
+                yield heapq.heappop(waiting)
+                following += 1
+        while waiting:  # after a gap: the part of the last flush that a torn file has lost
+            yield heapq.heappop(waiting)
 
 
 def messages(path: str | Path) -> list[Message]:

@@ -64,12 +64,12 @@ def scores(*said: Message, cutoff: float | None = None) -> list[Score]:
 
 
 def test_truth_is_interpolated_and_waited_for() -> None:
-    shown = missions.picture(1.25, [7], [(5, 5)])
-    before, after = missions.truth(1, [1], [(0, 0)]), missions.truth(2, [1], [(8, 4)])
+    shown = missions.picture(1.25, [7], [(2, 5)])
+    before, after = missions.truth(1, [1], [(-4, 0)]), missions.truth(2, [1], [(8, 4)])
     for order in ([shown, before, after], [before, shown, after], [before, after, shown]):
         (score,) = scores(*order)
         assert score.ids.tolist() == [1]
-        assert score.error == pytest.approx([5.0])  # (2, 1) to (5, 5)
+        assert score.error == pytest.approx([5.0])  # (-1, 1) to (2, 5)
     assert scores(before, shown) == []
     assert scores(shown, after) == []  # nothing is known of the time before
 
