@@ -92,7 +92,7 @@ def test_existence_is_calibrated() -> None:
     """Targets that exist with probability .4, seen with .7 among Poisson clutter: the mean posterior existence
     given what was seen equals the share that exists, for all and for the high and low ones apart."""
     rng = np.random.default_rng(11)
-    runs, r, p, side, clutter = 20_000, 0.4, 0.7, 10.0, 2.0
+    runs, r, p, side, clutter = 6_000, 0.4, 0.7, 10.0, 2.0
     model = Position(1.0, 1.0)
     truth, claimed = rng.random(runs) < r, np.empty(runs)
     for run in range(runs):
