@@ -6,7 +6,8 @@ Stankovic 1994) with joint association, and the marginal Poisson multi-Bernoulli
 with births where returns fall: a return that no track claims starts one with existence
 unused * birth / (birth + clutter), both intensities per unit of measurement space and scan.
 
-A track is reported once its existence has passed `confirm`, until it falls below `drop`.
+A track is reported once its existence has passed `confirm` (and, if so configured, once it has moved), until
+it falls below `drop`.
 """
 
 from __future__ import annotations
@@ -70,10 +71,9 @@ class Report:
 class LocalTracker:
     """Tracks of one sensor. Not for several threads.
 
-    Columns, one entry per track: ids (T,) i64, never used twice; means (4, T), covariances (4, 4, T),
-    existence (T,); first (2, T): where it started; farthest (T,): how far from there it
-    has been, m, less two standard deviations; born
-    (T,), updated (T,) i64 ns; confirmed (T,).
+    Columns, one entry per track, in the order of their age: ids (T,) i64, never used twice; means (4, T),
+    covariances (4, 4, T), existence (T,); first (2, T): where it started; farthest (T,): how far from there
+    it has been, m, less two standard deviations; born, updated (T,) i64 ns; confirmed (T,).
     """
 
     def __init__(self, config: TrackerConfig) -> None:
@@ -192,7 +192,6 @@ class LocalTracker:
             spread[[0, 1], [0, 1]] += config.extent**2
             apart = linalg.quadratic(spread, self.means[:, i] - self.means[:, j])
             keep = np.ones(len(self.ids), dtype=np.bool_)
-            # Tracks stand in the order of their age.
             for first, second in zip(i[apart < config.merge], j[apart < config.merge], strict=True):
                 keep[second] &= not keep[first]
             self._keep(keep)
