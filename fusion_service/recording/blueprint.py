@@ -16,7 +16,7 @@ __all__ = ["blueprint"]
 
 Corners = tuple[NDArray[np.float64], NDArray[np.float64]]
 
-PIXELS = 600
+PIXELS = 700
 """What a map of usual size shows of the picture's height."""
 METRES_PER_PIXEL = 156543.034
 """On the equator at zoom 0 (Web Mercator, tiles of 256 pixels)."""

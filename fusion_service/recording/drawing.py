@@ -32,8 +32,6 @@ U64 = NDArray[np.uint64]
 TENTATIVE, COASTING = STATUSES.index("tentative"), STATUSES.index("coasting")
 ALPHA = np.array([90, 255, 170])
 """Of tentative, confirmed and coasting tracks."""
-ABOVE = 25.0
-"""Draw order of the trails of truth: over other lines (20), under points (30)."""
 INTENSITY = 0.1
 """Components of an intensity that expect less than this are not drawn."""
 DEFAULT_PERIOD = 10.0
@@ -161,7 +159,7 @@ class Drawing:
         self._grow(table.place.xy, main=True)
         path = entity("picture", "truth", message.source)
         if self._first(path):
-            self._style(path, palette.TRUTH, radius=2.5, width=1.0, alpha=200, labels=False, order=ABOVE)
+            self._style(path, palette.TRUTH, radius=2.0, width=0.5, alpha=255, labels=False)
         table = self._trail(path, table, 0, stamp)
         self._columns.points(path, stamp, self._points(table.place, [f"target {track}" for track in table.ids]))
 
@@ -248,7 +246,6 @@ class Drawing:
         width: float,
         alpha: int,
         labels: bool,
-        order: float = 20.0,
     ) -> None:
         """What all rows of an entity, its ellipses and its trail share; sizes in points of the screen."""
         rr, static = self._rr, self._columns.static
@@ -257,7 +254,6 @@ class Drawing:
         faint = palette.packed(colour, alpha)
         static(f"{path}/ellipses", *_both(rr, "Lines", colors=[faint], radii=[-width]))
         static(f"{path}/trail", *_both(rr, "Lines", colors=[faint], radii=[-0.75 * width]))
-        static(f"{path}/trail", rr.LineStrips2D.from_fields(draw_order=order))
 
     def _grow(self, xy: Floats, *, main: bool) -> None:
         """Let the extent hold `xy` (T, 2); the grid and the view follow in steps."""

@@ -156,13 +156,13 @@ class Recorder:
             self._disconnect()
 
     def _disconnect(self) -> None:
-        """Write the index. A stream whose writer has died waits for it for ever, here or when the process ends: it is
-        left to a thread that nobody waits for."""
+        """Write the index. A stream whose writer has died waits for it for ever, here or when it is deleted or the
+        process ends: a thread that sleeps keeps it from being deleted."""
         if not self._broken:
             self._stream.disconnect()
             return
         import_rerun().unregister_shutdown()
-        threading.Thread(target=self._stream.disconnect, daemon=True).start()
+        threading.Thread(target=lambda _: threading.Event().wait(), args=(self._stream,), daemon=True).start()
 
     def _say(self, text: str, received: int) -> None:
         self._scene.journal.say("recorder", "WARN", text, Stamp(received, self._scene.now))

@@ -54,6 +54,7 @@ class Scene:
         self.drawing = Drawing(columns, frame)
         self.journal = Journal(columns, self.drawing)
         self.now: int | None = None
+        self._start: int | None = None
         self.undrawn: Counter[str] = Counter()
         self._charts = Charts(columns)
         self._assessment = Assessment(cutoff)
@@ -73,11 +74,15 @@ class Scene:
         if from_centre or not self._by_centre:
             self._by_centre = from_centre
             self.now = at if self.now is None or from_centre else max(self.now, at)
+            self._start = at if self._start is None else self._start
         return at
 
     def add(self, message: Message, stamp: Stamp) -> None:
-        """Take a message for the next `draw`."""
-        self._new.append((message, stamp))
+        """Take a message for the next `draw`; without a mission time it is drawn at that of its arrival."""
+        if isinstance(message, LocalTracks | LocalIntensity | Truth) and stamp.time is None:
+            self._leave_out(message.source, "its time is far ahead", 1, stamp._replace(time=self.now))
+        else:
+            self._new.append((message, stamp if stamp.time is not None else stamp._replace(time=self.now)))
 
     def alive(self, scope: str, name: str, alive: bool, stamp: Stamp) -> None:
         """A liveliness token came or went."""
@@ -93,9 +98,8 @@ class Scene:
         tracks = [message for message, _ in drawn if isinstance(message, LocalTracks | LocalIntensity | GlobalTracks)]
         faults = dict(zip(map(id, tracks), check_numbers(tracks), strict=True))
         for message, stamp in drawn:
-            reason = self._unfit(message, stamp)
-            stamp = stamp if stamp.time is not None else stamp._replace(time=self.now)
-            if reason:
+            stamp = stamp if stamp.time is not None else stamp._replace(time=self._start)
+            if reason := self._unfit(message):
                 self._leave_out(message.source, reason, 1, stamp)
                 continue
             fault = faults.get(id(message), np.zeros(0, dtype=np.uint8))
@@ -121,10 +125,8 @@ class Scene:
                 self.drawing.open_chart(best[0])
         return self.drawing.chart is not None and self.now is not None
 
-    def _unfit(self, message: Message, stamp: Stamp) -> str:
+    def _unfit(self, message: Message) -> str:
         """Why a message as a whole is not drawn; empty if it is."""
-        if isinstance(message, LocalTracks | LocalIntensity | Truth) and stamp.time is None:
-            return "its time is far ahead"
         if not isinstance(message, SensorInfo | Status | StepLog) and len(message.means) > MAX_TRACKS:
             return f"more than {MAX_TRACKS} tracks"
         new = isinstance(message, LocalTracks | LocalIntensity | SensorInfo)

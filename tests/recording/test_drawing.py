@@ -94,6 +94,20 @@ def test_sensors_and_what_they_see(flown: tuple[Path, list[Sent]]) -> None:
     assert 0.2 - 0.01 < azimuth.min() < 0.21 < 2.19 < azimuth.max() < 2.2 + 0.01  # azimuth 1.2, width 2
 
 
+def test_a_sensor_is_drawn_from_its_arrival_on(tmp_path: Path) -> None:
+    """And one that was there before the first track from then on."""
+    said = [
+        missions.info("a"),
+        missions.tracks("a", 0, [1], [(0, 0)]),
+        missions.info("b"),
+        missions.info("a", period=2.0),
+    ]
+    moved = missions.info("b", position=(7.0, 0.0, 0.0))
+    record(tmp_path / "a.rrd", *said, missions.tracks("a", 5, [1], [(0, 0)]), moved, missions.tracks("a", 9, [], []))
+    times = [[item["time"] for item in rows(tmp_path / "a.rrd", f"/picture/sensors/{name}")] for name in "ab"]
+    assert times == [[missions.at(0)], [missions.at(0), missions.at(5)]]
+
+
 def test_a_polygon_is_drawn_where_it_is(tmp_path: Path) -> None:
     corners = ((0.0, 0.0), (100.0, 0.0), (100.0, 50.0))
     info = missions.info("radar", position=(10.0, 20.0, 0.0), coverage=Polygon(corners))
