@@ -12,29 +12,29 @@ from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from importlib import metadata
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from fusion_service import linalg
-from fusion_service.association import by_size, candidate_pairs, cluster, leave_one_out, pair_distance, uniform_ci
+from fusion_service.association import by_size, uniform_ci
 from fusion_service.checkpoint import pack_state, unpack_state
 from fusion_service.config import CentreConfig, centre_config, config_hash
 from fusion_service.intake import Event, Intake, Order, Refused, SourceFound, SourceLost
 from fusion_service.journal import Journal
-from fusion_service.lifecycle import advance, empty_picture, newborn
+from fusion_service.lifecycle import advance, empty_picture
+from fusion_service.linking import Linker
 from fusion_service.motion import predict
+from fusion_service.rows import NO_TRACK, Rows, usable_rows, write_back
 from fusion_service.rules import Fused, fuse_last
-from fusion_service.sources import Source, Tracks
+from fusion_service.sources import Source
 from schemas import ORIGINS, Entry, GlobalTracks, Local, Status, StepLog
 from schemas import messages as words
 
 __all__ = ["FusionCentre", "Order", "Refused", "SourceFound", "SourceLost", "StepResult"]
 
 VERSION = metadata.version("track-fusion-centre")
-NO_TRACK = np.uint64(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,20 +44,6 @@ class StepResult:
     tracks: GlobalTracks
     log: StepLog
     status: Status
-
-
-class Rows(NamedTuple):
-    """The M usable local tracks of all sources at the time of the step, in canonical order.
-
-    source: index into the sorted names; the columns of `Tracks`, with mean (n, M) and covariance (n, n, M)
-    predicted and marginalised to the centre's space; kept: for each source the rows of its table used.
-    """
-
-    source: NDArray[np.intp]
-    epoch: NDArray[np.uint64]
-    tracks: Tracks
-    may_start: NDArray[np.bool_]
-    kept: dict[str, NDArray[np.intp]]
 
 
 class FusionCentre:
@@ -83,22 +69,19 @@ class FusionCentre:
         self._n = len(self.config.space)
         self._intake = Intake(self.config)
         self._picture = empty_picture(self._n)
-        self._agreeing: dict[tuple[int, int], int] = {}
+        self._linker = Linker(self.config)
         self._step = 0
         self._published = 0
         self._time = -1
-        self._next_id = 1
         self._journal = Journal(self.config.name, self.config_hash, VERSION)
         start: dict[str, Any] = {"kind": "start", "epoch": epoch}
         if checkpoint is not None:
             self._restore(checkpoint)
             start["checkpoint"] = checkpoint
         if generation is not None:
-            self._next_id = (generation << 32) + 1
+            self._linker.next_id = (generation << 32) + 1
             start["generation"] = generation
         self._journal.event(start)
-        gates = chi2.ppf([self.config.gate, self.config.keep_gate], self._n)
-        self._gate, self._keep_gate = float(gates[0]), float(gates[1])
 
     @property
     def time(self) -> int:
@@ -119,16 +102,14 @@ class FusionCentre:
         orders = self._intake.admit(time, self._time, journal)
         self._obey(orders)
         self._time = time
-        rows = self._rows(time)
+        rows = usable_rows(self._intake, time)
         names = self._intake.names()
         journal.name_sources(names)
-        self._check_links(rows)
-        pairs = self._link(rows, time)
-        self._merge(rows, pairs)
-        contributions = self._fuse(rows, time)
-        self._live(rows, contributions, time)
-        self._write_back(rows)
-        tracks = self._publish(rows, contributions, names)
+        self._associate(rows, time)
+        influence = self._fuse(rows, time)
+        self._live(rows, time)
+        write_back(rows, self._intake)
+        tracks = self._publish(rows, influence, names)
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         return StepResult(tracks, log, self._status(time))
@@ -141,8 +122,8 @@ class FusionCentre:
                 "space": list(self.config.space),
                 "step": self._step,
                 "time": self._time,
-                "next_id": self._next_id,
-                "agreeing": [[a, b, count] for (a, b), count in sorted(self._agreeing.items())],
+                "next_id": self._linker.next_id,
+                "agreeing": [[a, b, count] for (a, b), count in sorted(self._linker.agreeing.items())],
             },
             self._intake,
             self._picture,
@@ -150,8 +131,8 @@ class FusionCentre:
 
     def _restore(self, blob: bytes) -> None:
         state, picture = unpack_state(blob, self._intake, self.config.space)
-        self._step, self._time, self._next_id = state["step"], state["time"], state["next_id"]
-        self._agreeing = {(a, b): count for a, b, count in state["agreeing"]}
+        self._step, self._time, self._linker.next_id = state["step"], state["time"], state["next_id"]
+        self._linker.agreeing = {(a, b): count for a, b, count in state["agreeing"]}
         self._picture = picture
 
     def _obey(self, orders: list[Order]) -> None:
@@ -160,171 +141,29 @@ class FusionCentre:
             gone = np.isin(self._picture.id, np.array(doomed, dtype=np.uint64))
             for track in self._picture.id[gone].tolist():
                 self._journal.end(track, "ordered", None)
-            self._unlink(self._picture.id[gone])
+            self._relink(dict.fromkeys(self._picture.id[gone].tolist(), 0))
             self._picture = self._picture.take(~gone)
 
-    def _unlink(self, ids: NDArray[np.uint64]) -> None:
-        for source in self._intake.sources.values():
-            gone = np.isin(source.tracks.link, ids)
-            if gone.any():
-                source.tracks = replace(source.tracks, link=np.where(gone, NO_TRACK, source.tracks.link))
-
-    # One step, in order
-
-    def _rows(self, time: int) -> Rows:
-        parts: list[Tracks] = []
-        source_index: list[NDArray[np.intp]] = []
-        epochs: list[NDArray[np.uint64]] = []
-        starts: list[NDArray[np.bool_]] = []
-        kept: dict[str, NDArray[np.intp]] = {}
-        for index, (name, source) in enumerate(sorted(self._intake.sources.items())):
-            said = self._intake.declared(source)
-            oldest = time - round(self.config.stale_periods * said.period * 1e9)
-            table = source.tracks
-            source.tracks = table = table.take(table.time >= oldest)
-            if source.muted or not self._intake.ready(source):
-                continue
-            dt = (time - table.time) / 1e9
-            mean, covariance = predict(said.motion, source.space, table.mean, table.covariance, dt)
-            at = [source.space.index(component) for component in self.config.space]
-            mean, covariance = mean[at], covariance[np.ix_(at, at)]
-            sound = np.flatnonzero(linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0))
-            kept[name] = sound
-            parts.append(replace(table, mean=mean, covariance=covariance).take(sound))
-            source_index.append(np.full(len(sound), index, dtype=np.intp))
-            epochs.append(np.full(len(sound), source.epoch, dtype=np.uint64))
-            starts.append(np.full(len(sound), said.may_start, dtype=np.bool_))
-        if not parts:
-            nothing = self._intake.nothing()
-            zero = np.zeros(0, dtype=np.intp)
-            return Rows(zero, nothing.id, nothing, zero.astype(np.bool_), kept)
-        columns = (np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in Tracks.__slots__)
-        return Rows(
-            np.concatenate(source_index), np.concatenate(epochs), Tracks(*columns), np.concatenate(starts), kept
-        )
-
-    def _check_links(self, rows: Rows) -> None:
-        """Keep a standing link while its track agrees with the fusion of the others; break it on evidence."""
-        tracks = rows.tracks
-        linked = np.flatnonzero(tracks.link != NO_TRACK)
-        if not len(linked):
+    def _relink(self, new: dict[int, int]) -> None:
+        """Change the links of all tables: {old global id: new one, or 0}."""
+        if not new:
             return
-        links = tracks.link[linked]
-        distance = leave_one_out(links, tracks.mean[:, linked], tracks.covariance[:, :, linked])
-        failed = distance > self._keep_gate
-        tracks.fails[linked] = np.where(failed, tracks.fails[linked] + 1, 0)
-        self._journal.decide(words.GATE_FAILED, rows, linked[failed], links[failed], distance[failed])
-        ripe = np.flatnonzero(tracks.fails[linked] >= self.config.break_after)
-        if len(ripe):
-            # of one global track only the worst leaves at a time: farthest, then youngest, then last in order
-            order = np.lexsort((-ripe, -tracks.since[linked[ripe]], -distance[ripe], links[ripe]))
-            first = np.append(True, links[ripe][order][1:] != links[ripe][order][:-1])
-            worst = ripe[order][first]
-            self._journal.decide(words.BROKEN, rows, linked[worst], links[worst], distance[worst])
-            self._journal.broken = {int(row): int(link) for row, link in zip(linked[worst], links[worst], strict=True)}
-            tracks.link[linked[worst]] = NO_TRACK
-            tracks.fails[linked] = np.where(np.isin(links, links[worst]), 0, tracks.fails[linked])
-        stays = tracks.link[linked] != NO_TRACK
-        self._journal.decide(
-            words.KEPT, rows, linked[stays & ~failed], links[stays & ~failed], distance[stays & ~failed]
-        )
-
-    def _link(self, rows: Rows, time: int) -> list[tuple[int, int, float]]:
-        """Link free tracks to global tracks or to each other; return the pairs of global tracks that agree."""
-        tracks, picture = rows.tracks, self._picture
-        mean, covariance = self._predicted(time)
-        linked = np.flatnonzero(tracks.link != NO_TRACK)
-        bits = np.left_shift(1, rows.source) if rows.source.max(initial=0) < 62 else _wide_bits(rows.source)
-        masks = np.zeros(len(picture.id), dtype=bits.dtype)
-        for ids, members in by_size(tracks.link[linked]):
-            at, chosen = picture.find(ids), linked[members]
-            fused = uniform_ci(
-                np.moveaxis(tracks.mean[:, chosen], 2, 0), np.moveaxis(tracks.covariance[:, :, chosen], 3, 0)
-            )
-            mean[:, at], covariance[:, :, at] = fused
-            masks[at] = np.bitwise_or.reduce(bits[chosen], axis=1)
-        free = np.flatnonzero(tracks.link == NO_TRACK)
-        known = np.flatnonzero(picture.time >= 0)
-        count = len(known)
-        mean = np.concatenate([mean[:, known], tracks.mean[:, free]], axis=1)
-        covariance = np.concatenate([covariance[:, :, known], tracks.covariance[:, :, free]], axis=2)
-        masks = np.concatenate([masks[known], bits[free]])
-        places = [self.config.space.index(axis) for axis in ("x", "y", "z") if axis in self.config.space]
-        sigma = np.sqrt(sum(covariance[place, place] for place in places))
-        i, j = candidate_pairs(mean[places], sigma, float(np.sqrt(self._gate)))
-        disjoint = (masks[i] & masks[j]) == 0
-        i, j = i[disjoint], j[disjoint]
-        distance, spread = pair_distance(mean, covariance, i, j)
-        near = distance <= self._gate
-        i, j, distance, spread = i[near], j[near], distance[near], spread[near]
-        both = j < count
-        agreeing = [
-            (int(picture.id[known[a]]), int(picture.id[known[b]]), float(d))
-            for a, b, d in zip(i[both], j[both], distance[both], strict=True)
-        ]
-        if len(free):
-            whole = [k < count for k in range(mean.shape[1])]
-            root, _ = cluster(i[~both], j[~both], (distance + spread)[~both], masks.tolist(), whole)
-            best = dict(zip(zip(i.tolist(), j.tolist(), strict=True), distance.tolist(), strict=True))
-            self._settle(rows, free, known, np.array(root, dtype=np.intp), best, time)
-        return agreeing
-
-    def _settle(
-        self,
-        rows: Rows,
-        free: NDArray[np.intp],
-        known: NDArray[np.intp],
-        root: NDArray[np.intp],
-        distance: dict[tuple[int, int], float],
-        time: int,
-    ) -> None:
-        """Give every free track of a cluster its global track, a new one where the cluster has none."""
-        tracks, count = rows.tracks, len(known)
-        roots = root[count:]
-        starting = np.unique(roots[(roots >= count) & rows.may_start[free]])
-        new_ids = np.arange(self._next_id, self._next_id + len(starting), dtype=np.uint64)
-        self._next_id += len(starting)
-        ids = np.zeros(len(root), dtype=np.uint64)
-        ids[:count] = self._picture.id[known]
-        ids[starting] = new_ids
-        given = ids[roots]
-        takes = given != NO_TRACK
-        tracks.link[free] = given
-        tracks.since[free[takes]] = self._step
-        tracks.fails[free[takes]] = 0
-        tracks.used[free[takes]] = -1
-        values = np.array([distance.get((int(r), count + k), np.nan) for k, r in enumerate(roots)])
-        self._journal.decide(words.LINKED, rows, free[takes], given[takes], values[takes])
-        self._journal.birth(new_ids)
-        born = set(new_ids.tolist())
-        for row, old in self._journal.broken.items():
-            link = int(tracks.link[row])
-            if link in born:
-                self._journal.split(link, old)
-        self._picture = self._picture.join(newborn(new_ids, self._n, time))
-
-    def _merge(self, rows: Rows, pairs: list[tuple[int, int, float]]) -> None:
-        """Join global tracks that have agreed for several steps in a row: the older one lives on."""
-        self._agreeing = {(a, b): self._agreeing.get((a, b), 0) + 1 for a, b, _ in pairs}
-        ripe = [(a, b, d) for a, b, d in pairs if self._agreeing[a, b] >= self.config.merge_after]
-        taken: set[int] = set()
-        for a, b, distance in sorted(ripe, key=lambda pair: (pair[2], pair[0], pair[1])):
-            if taken & {a, b}:
-                continue
-            taken |= {a, b}
-            old, new = np.uint64(a), np.uint64(b)
-            self._journal.merge(a, b, distance)
-            moved = rows.tracks.link == new
-            rows.tracks.link[moved] = old
-            rows.tracks.since[moved] = self._step
-            self._move_links(new, old)
-            self._picture = self._picture.take(self._picture.id != new)
-        self._agreeing = {pair: count for pair, count in self._agreeing.items() if not taken & set(pair)}
-
-    def _move_links(self, old: np.uint64, new: np.uint64) -> None:
+        old = np.array(sorted(new), dtype=np.uint64)
+        to = np.array([new[track] for track in old.tolist()], dtype=np.uint64)
         for source in self._intake.sources.values():
             link = source.tracks.link
-            source.tracks = replace(source.tracks, link=np.where(link == old, new, link))
+            at = np.minimum(np.searchsorted(old, link), len(old) - 1)
+            source.tracks = replace(source.tracks, link=np.where(old[at] == link, to[at], link))
+
+    def _associate(self, rows: Rows, time: int) -> None:
+        linker, journal = self._linker, self._journal
+        linker.check(rows, journal)
+        self._picture, agreements = linker.link(rows, self._picture, *self._predicted(time), self._step, time, journal)
+        merged = linker.merge(rows, agreements, self._step, journal)
+        self._relink(merged)
+        if merged:
+            gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
+            self._picture = self._picture.take(~gone)
 
     def _predicted(self, time: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         picture = self._picture
@@ -368,9 +207,8 @@ class FusionCentre:
         self._picture = replace(picture, mean=mean, covariance=covariance, time=state_time)
         return influence
 
-    def _live(self, rows: Rows, influence: NDArray[np.float64], time: int) -> None:
-        tracks, picture = rows.tracks, self._picture
-        linked = np.flatnonzero(tracks.link != NO_TRACK)
+    def _live(self, rows: Rows, time: int) -> None:
+        tracks, picture, linked = rows.tracks, self._picture, rows.linked()
         at = picture.find(tracks.link[linked])
         support = np.bincount(at, minlength=len(picture.id))
         updated = picture.updated.copy()
@@ -391,23 +229,11 @@ class FusionCentre:
             self._journal.end(track, "lost", None)
         for status, decision in ((words.CONFIRMED, words.CONFIRMED_NOW), (words.COASTING, words.COASTING_NOW)):
             self._journal.tracks(decision, picture.id[(picture.status == status) & (before != status) & ~ended])
-        self._unlink(picture.id[ended])
+        self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
         self._picture = picture.take(~ended)
 
-    def _write_back(self, rows: Rows) -> None:
-        start = 0
-        for name, kept in rows.kept.items():
-            source, end = self._intake.sources[name], start + len(kept)
-            columns = {}
-            for column in ("link", "since", "fails", "used"):
-                columns[column] = getattr(source.tracks, column).copy()
-                columns[column][kept] = getattr(rows.tracks, column)[start:end]
-            source.tracks = replace(source.tracks, **columns)
-            start = end
-
     def _publish(self, rows: Rows, influence: NDArray[np.float64], names: tuple[str, ...]) -> GlobalTracks:
-        picture, tracks = self._picture, rows.tracks
-        linked = np.flatnonzero(tracks.link != NO_TRACK)
+        picture, tracks, linked = self._picture, rows.tracks, rows.linked()
         linked = linked[np.argsort(tracks.link[linked], kind="stable")]
         counts = np.bincount(picture.find(tracks.link[linked]), minlength=len(picture.id))
         origins = {source.origin for source in self._intake.sources.values() if source.messages}
@@ -478,9 +304,3 @@ class FusionCentre:
 def _influence(fused: Fused) -> NDArray[np.float64]:
     assert fused.influence is not None
     return fused.influence
-
-
-def _wide_bits(source: NDArray[np.intp]) -> NDArray[Any]:
-    bits = np.empty(len(source), dtype=object)
-    bits[:] = [1 << int(index) for index in source]
-    return bits

@@ -194,6 +194,7 @@ def run_demo(
         f'{mission.centre}\n[bus]\nconnect = ["{endpoint}"]\n\n[service]\nstate = "{folder / "state"}"\n'
     )
     _check_config(config)
+    print(f"{scenario}: {mission.seconds:g} s of mission at {speed:g} times real time, into {folder}", flush=True)
     _fly(mission, folder, config, recording, endpoint, speed, stop)
     if stop.is_set():
         print(f"stopped; the recording so far: {recording}")

@@ -12,7 +12,7 @@ from schemas import Decisions, Entry, StepLog
 from schemas import messages as words
 
 if TYPE_CHECKING:
-    from fusion_service.centre import Rows
+    from fusion_service.rows import Rows
 
 __all__ = ["Journal"]
 
@@ -73,6 +73,11 @@ class Journal:
         if len(at):
             ids = rows.tracks.id[at]
             self._column(kind, tracks, rows.source[at], rows.epoch[at], ids, np.zeros_like(ids), value)
+
+    def broke(self, rows: Rows, at: NDArray[np.intp], tracks: NDArray[np.uint64], value: NDArray[np.float64]) -> None:
+        """The links of the local tracks `at` to the global ids `tracks` are broken."""
+        self.decide(words.BROKEN, rows, at, tracks, value)
+        self.broken = dict(zip(at.tolist(), tracks.tolist(), strict=True))
 
     def tracks(self, kind: int, tracks: NDArray[np.uint64], other: NDArray[np.uint64] | None = None) -> None:
         """One decision for each of the global ids `tracks`."""

@@ -1,0 +1,84 @@
+"""The local tracks of all sources as one step sees them: predicted to its time, in one state space, in one order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.intake import Intake
+from fusion_service.motion import predict
+from fusion_service.sources import Tracks
+
+__all__ = ["NO_TRACK", "Rows", "usable_rows", "write_back"]
+
+NO_TRACK = np.uint64(0)
+"""The link of a track that belongs to no global track."""
+LINK_COLUMNS = ("link", "since", "fails", "used")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """M usable local tracks in canonical order (source, epoch, id).
+
+    source (M,): index into the sorted names. epoch (M,) u64. tracks: their columns, mean (n, M) and covariance
+    (n, n, M) predicted and marginalised to the centre's space; the columns of links may be written. may_start
+    (M,). kept: for each source which rows of its own table these are.
+    """
+
+    source: NDArray[np.intp]
+    epoch: NDArray[np.uint64]
+    tracks: Tracks
+    may_start: NDArray[np.bool_]
+    kept: dict[str, NDArray[np.intp]]
+
+    def linked(self) -> NDArray[np.intp]:
+        """Rows that belong to a global track."""
+        return np.flatnonzero(self.tracks.link != NO_TRACK)
+
+
+def usable_rows(intake: Intake, time: int) -> Rows:
+    """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table; what
+    has no sound density there is left out."""
+    config = intake.config
+    parts: list[Tracks] = []
+    index: list[NDArray[np.intp]] = []
+    epochs: list[NDArray[np.uint64]] = []
+    starts: list[NDArray[np.bool_]] = []
+    kept: dict[str, NDArray[np.intp]] = {}
+    for number, (name, source) in enumerate(sorted(intake.sources.items())):
+        said = intake.declared(source)
+        oldest = time - round(config.stale_periods * said.period * 1e9)
+        source.tracks = table = source.tracks.take(source.tracks.time >= oldest)
+        if source.muted or not intake.ready(source):
+            continue
+        dt = (time - table.time) / 1e9
+        mean, covariance = predict(said.motion, source.space, table.mean, table.covariance, dt)
+        at = [source.space.index(component) for component in config.space]
+        mean, covariance = mean[at], covariance[np.ix_(at, at)]
+        sound = np.flatnonzero(linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0))
+        kept[name] = sound
+        parts.append(replace(table, mean=mean, covariance=covariance).take(sound))
+        index.append(np.full(len(sound), number, dtype=np.intp))
+        epochs.append(np.full(len(sound), source.epoch, dtype=np.uint64))
+        starts.append(np.full(len(sound), said.may_start, dtype=np.bool_))
+    if not parts:
+        nothing = intake.nothing()
+        return Rows(np.zeros(0, dtype=np.intp), nothing.id, nothing, np.zeros(0, dtype=np.bool_), kept)
+    columns = (np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in Tracks.__slots__)
+    return Rows(np.concatenate(index), np.concatenate(epochs), Tracks(*columns), np.concatenate(starts), kept)
+
+
+def write_back(rows: Rows, intake: Intake) -> None:
+    """Put the columns of links back into the sources' own tables."""
+    start = 0
+    for name, kept in rows.kept.items():
+        source, end = intake.sources[name], start + len(kept)
+        columns = {}
+        for column in LINK_COLUMNS:
+            columns[column] = getattr(source.tracks, column).copy()
+            columns[column][kept] = getattr(rows.tracks, column)[start:end]
+        source.tracks = replace(source.tracks, **columns)
+        start = end
