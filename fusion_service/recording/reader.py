@@ -1,16 +1,19 @@
 """The messages of a recording, as they came.
 
-A recorder that was killed leaves a file without its index, perhaps with half a record at its end. Rerun reads
-the first kind as it is; the second is copied up to its last whole record by `rerun rrd merge
---continue-on-error`, and the copy is read. What was flushed is never lost.
+A recorder that was killed leaves a file without its index, perhaps with half a record at its end. Rerun opens the
+first kind as it is, the second only once it is cut after its last whole record, which `repair` does; `read` does it
+on a copy. What was flushed is never lost.
+
+The file (RRF2) is a header of 12 bytes, then records: kind and length (u64 each, little-endian), payload.
 """
 
 from __future__ import annotations
 
 import heapq
-import importlib.util
 import logging
-import subprocess
+import os
+import shutil
+import struct
 import tempfile
 import warnings
 from collections import Counter
@@ -23,9 +26,11 @@ import numpy as np
 from fusion_service.recording.columns import import_rerun
 from schemas import Message, MessageError, decode
 
-__all__ = ["RawMessage", "messages", "read"]
+__all__ = ["RawMessage", "messages", "read", "repair"]
 
 log = logging.getLogger(__name__)
+
+MAGIC, HEADER, RECORD, END = b"RRF2", 12, struct.Struct("<QQ"), 0
 
 
 class RawMessage(NamedTuple):
@@ -49,7 +54,7 @@ def read(path: str | Path) -> Iterator[RawMessage]:
     with tempfile.TemporaryDirectory(prefix="rrd-") as folder:
         waiting: list[RawMessage] = []
         following = 0
-        for chunk in _open(path, Path(folder)).stream().filter(content="/raw/**"):
+        for chunk in _open_whole(path, Path(folder)).stream().filter(content="/raw/**"):
             for message in _rows(chunk):
                 heapq.heappush(waiting, message)
             while waiting and waiting[0].arrival == following:
@@ -77,8 +82,38 @@ def _counts(counter: Counter[str]) -> str:
     return ", ".join(f"{reason} {count}" for reason, count in sorted(counter.items()))
 
 
-def _open(path: Path, folder: Path) -> Any:
-    """A reader of `path`, or of its repaired copy in `folder`."""
+def _open_whole(path: Path, folder: Path) -> Any:
+    """A reader of `path`, or if that is torn, of its whole part in `folder`."""
+    try:
+        return _open(path)
+    except _TornError as error:
+        log.warning("%s: reading the whole part", error)
+        copy = folder / path.name
+        shutil.copyfile(path, copy)
+        repair(copy)
+        return _open(copy)
+
+
+def repair(path: str | Path) -> int:
+    """Cut a torn recording, in place, after its last whole record, so that viewers open it. Returns the bytes cut,
+    0 for a file that opens. `ValueError` for a file that is no recording."""
+    path = Path(path)
+    try:
+        _open(path)
+        return 0
+    except _TornError:
+        size = path.stat().st_size
+        os.truncate(path, _whole(path))
+        _open(path)
+        return size - path.stat().st_size
+
+
+class _TornError(ValueError):
+    """A recording that ends within a record."""
+
+
+def _open(path: Path) -> Any:
+    """A reader of `path`."""
     import_rerun()
     from rerun.chunk import RrdReader
 
@@ -89,22 +124,25 @@ def _open(path: Path, folder: Path) -> Any:
             if reader.recordings():
                 return reader
         except RuntimeError as error:
-            log.warning("%s is torn, reading a repaired copy (%s)", path, error)
-            repaired = _repair(path, folder / path.name)
-            if repaired is not None and (reader := RrdReader(repaired)).recordings():
-                return reader
+            if 0 < _whole(path) < path.stat().st_size:
+                raise _TornError(f"{path} is torn ({error})") from None
     raise ValueError(f"{path} is not a recording")
 
 
-def _repair(path: Path, target: Path) -> Path | None:
-    spec = importlib.util.find_spec("rerun_cli")
-    binary = Path(str(spec.origin)).with_name("rerun") if spec else Path("rerun")
-    command: list[str | Path] = [binary, "rrd", "merge", "--continue-on-error", path, "-o", target]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode or not target.is_file():
-        log.warning("no repair of %s: %s", path, done.stderr.strip().splitlines()[-1:])
-        return None
-    return target
+def _whole(path: Path) -> int:
+    """The length of `path` up to the end of its last whole record, 0 for another kind of file."""
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        if file.read(HEADER)[:4] != MAGIC:
+            return 0
+        whole = HEADER
+        while whole + RECORD.size <= size:
+            file.seek(whole)
+            kind, length = RECORD.unpack(file.read(RECORD.size))
+            if kind == END or whole + RECORD.size + length > size:
+                break
+            whole += RECORD.size + length
+    return whole
 
 
 def _rows(chunk: Any) -> Iterator[RawMessage]:

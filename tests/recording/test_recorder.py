@@ -6,6 +6,7 @@ import logging
 import os
 import signal
 import time
+import warnings
 from pathlib import Path
 
 import missions
@@ -17,7 +18,7 @@ from recording.mission import START, Sent, mission
 from rerun.chunk import RrdReader
 
 from fusion_service.bus import open_bus
-from fusion_service.recording import RawMessage, Recorder, default_path, messages, read
+from fusion_service.recording import RawMessage, Recorder, default_path, messages, read, repair
 from schemas import Message, encode, local_key
 
 SECOND = 10**9
@@ -109,6 +110,26 @@ def test_a_file_that_ends_anywhere_gives_all_that_is_whole(tmp_path: Path, torn:
     count = sum(size <= whole for size in sizes)
     assert count >= len(said) - 5
     assert found == [sent.data for sent in said[:count]]
+
+
+@pytest.mark.parametrize("torn", [0, 1, 30, 45, 60, 200, 2000, 20_000])
+def test_a_torn_recording_opens_once_it_is_repaired(flown: tuple[Path, list[Sent]], tmp_path: Path, torn: int) -> None:
+    """Cut in its index, behind it and before it."""
+    path = tmp_path / "torn.rrd"
+    content = flown[0].read_bytes()
+    path.write_bytes(content[: len(content) - torn])
+    before = [raw.data for raw in read(path)]
+    cut = repair(path)
+    assert torn or not cut
+    assert path.read_bytes() == content[: len(content) - torn - cut]
+    assert repair(path) == 0
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "RRD file has no footer")
+        reader = RrdReader(path)
+    assert len(reader.recordings()) == 1
+    assert reader.blueprints()
+    assert [raw.data for raw in read(path)] == before == [sent.data for sent in flown[1]][: len(before)]
+    assert len(before) > 700
 
 
 FILL = """
