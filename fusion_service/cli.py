@@ -49,6 +49,7 @@ def _parser() -> argparse.ArgumentParser:
     record = command("record", "Record everything on the bus.", "fusion-service record --out mission.rrd")
     record.add_argument("--out", metavar="FILE", help="recording (default runs/mission-<UTC time>.rrd)")
     record.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"hub to join (default {ENDPOINT})")
+    record.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
     record.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
 
     demo = command(
@@ -105,7 +106,7 @@ def _record(args: argparse.Namespace, stop: threading.Event) -> None:
     path = Path(args.out) if args.out else default_path()
     path.parent.mkdir(parents=True, exist_ok=True)
     with open_bus(args.connect or [ENDPOINT], stop=stop) as bus:
-        run_recorder(bus, path, realm=args.realm, stop=stop)
+        run_recorder(bus, path, realm=args.realm, stop=stop, cutoff=args.cutoff)
 
 
 def _demo(args: argparse.Namespace, stop: threading.Event) -> None:

@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ log = logging.getLogger(__name__)
 START = 2.5
 """Seconds that the clients have to be up before the mission begins."""
 READY = 30.0
+JITTER = 1.5
 STOP = 5.0
 
 
@@ -50,12 +51,15 @@ class Mission:
     speed: float
     cutoff: float
     every: float | None
-    origin: tuple[float, float] = field(default=(0.0, 0.0))
+    lateness: float
+
+    def toml(self, speed: float) -> str:
+        """The centre's settings; a client that the machine holds up for `JITTER` seconds is still waited for."""
+        return f"lateness = {max(self.lateness, JITTER * speed)}\n{self.centre}"
 
 
 THREE_RADARS = """\
 period = 10.0
-lateness = 15.0
 frame = {kind = "enu", lat = 59.7138694, lon = -55.2676093}   # collocated with radar 1 (Sharma 6.4)
 motion = {kind = "cv", q = 10.0}
 coast = 25.0
@@ -63,7 +67,6 @@ coast = 25.0
 
 AUTOFERRY = """\
 period = 1.0
-lateness = 3.0
 frame = {kind = "enu", lat = 63.4389029083, lon = 10.39908278, alt = 39.923}   # Piren
 motion = {kind = "cv", q = 0.1}
 coast = 3.0
@@ -74,7 +77,9 @@ def _mission(scenario: str, data: str | None, seed: int) -> Mission:
     if scenario == "three-radars":
         command = ["simulate", "three-radars", "--seed", str(seed), "--sensor"]
         sensors = ("radar1", "radar2", "radar3", "truth")
-        return Mission(scenario, {name: [*command, name] for name in sensors}, THREE_RADARS, 300.0, 10.0, 5000.0, None)
+        return Mission(
+            scenario, {name: [*command, name] for name in sensors}, THREE_RADARS, 300.0, 10.0, 5000.0, None, 15.0
+        )
     kind, _, number = scenario.partition(":")
     if kind != "autoferry" or not number.isdigit():
         raise DemoError(f"unknown scenario {scenario!r}: use three-radars, or autoferry:N with N one of 2 3 5 13 16")
@@ -85,7 +90,7 @@ def _mission(scenario: str, data: str | None, seed: int) -> Mission:
         raise DemoError(f"no scenario{number}_detections.json in {folder}: --data names the Autoferry folder")
     command = ["playback", scenario, "--data", str(folder), "--sensor"]
     clients = {name: [*command, name] for name in ("lidar", "radar", "truth")}
-    return Mission(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0)
+    return Mission(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)
 
 
 class Crew:
@@ -191,7 +196,7 @@ def run_demo(
     options = f'{{criterion = "{criterion}"}}' if criterion else "{}"
     config.write_text(
         f'[centre]\nclock = "message"\nrule = "{rule}"\nrule_options = {options}\nmemory = "{memory}"\n'
-        f'{mission.centre}\n[bus]\nconnect = ["{endpoint}"]\n\n[service]\nstate = "{folder / "state"}"\n'
+        f'{mission.toml(speed)}\n[bus]\nconnect = ["{endpoint}"]\n\n[service]\nstate = "{folder / "state"}"\n'
     )
     _check_config(config)
     print(f"{scenario}: {mission.seconds:g} s of mission at {speed:g} times real time, into {folder}", flush=True)
@@ -220,7 +225,8 @@ def _fly(
         bus.watch(local_key("*", "alive"), watch.on_token)
         bus.subscribe(global_key("*", "tracks"), watch.on_tracks)
         crew.start("service", ["fusion_service", "run", "--config", str(config)])
-        crew.start("record", ["fusion_service", "record", "--out", str(recording), "--connect", endpoint])
+        cutoff = ["--cutoff", str(mission.cutoff)]
+        crew.start("record", ["fusion_service", "record", "--out", str(recording), "--connect", endpoint, *cutoff])
         _wait(lambda: recording.exists() and global_key("centre", "alive") in watch.tokens, crew, stop)
         begin = time.time() + START
         for name, command in mission.clients.items():

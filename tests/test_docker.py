@@ -134,7 +134,7 @@ def test_the_example_config_is_the_demos(capsys: pytest.CaptureFixture[str]) -> 
     path = str(DOCKER / "centre.toml")
     assert cli.main(["check", path]) == 0
     assert f"{path}: good" in capsys.readouterr().out
-    wanted = centre_config({"clock": "message", "rule": "ci", **tomllib.loads(demo.THREE_RADARS)})
+    wanted = centre_config({"clock": "message", "rule": "ci", "lateness": 15.0, **tomllib.loads(demo.THREE_RADARS)})
     assert load_config(path).centre == wanted
 
 
