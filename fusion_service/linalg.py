@@ -30,6 +30,7 @@ __all__ = [
     "det",
     "inner",
     "inverse",
+    "inverse_det",
     "is_positive_definite",
     "ldl",
     "logdet",
@@ -49,8 +50,8 @@ __all__ = [
 
 FloatArray = NDArray[np.float64]
 
-CACHE_BYTES = 1 << 19
-"""What one block's (n, n, B) array may occupy: half a megabyte, some 4,000 matrices at n = 4."""
+CACHE_BYTES = 1 << 18
+"""What one block's (n, n, B) array may occupy: a quarter of a megabyte, some 2,000 matrices at n = 4."""
 
 TURN = 128
 """Elements transposed at a time: five times faster than a long array at once."""
@@ -71,11 +72,12 @@ def to_last(a: FloatArray, core: int) -> FloatArray:
     return out
 
 
-def to_first(a: FloatArray, batch: tuple[int, ...], core: int) -> FloatArray:
-    """The inverse of `to_last`: (*core axes, B) -> (*batch, *core axes), a contiguous copy."""
+def to_first(a: FloatArray, batch: tuple[int, ...], core: int, out: FloatArray | None = None) -> FloatArray:
+    """The inverse of `to_last`: (*core axes, B) -> (*batch, *core axes), a contiguous copy, or into `out`."""
     shape = a.shape[:core]
     size, entries = prod(batch), prod(shape)
-    out = np.empty((*batch, *shape))
+    if out is None:
+        out = np.empty((*batch, *shape))
     tall, wide = out.reshape(size, entries), a.reshape(entries, size)
     for i in range(0, size, TURN):
         tall[i : i + TURN] = wide[:, i : i + TURN].T
@@ -91,7 +93,13 @@ def blocks(n: int, size: int, copies: int = 1) -> Iterator[slice]:
 
 def inverse(P: FloatArray) -> FloatArray:
     """P^-1 (n, n, B) of symmetric positive definite P."""
-    return sweep(P)[0]
+    out = np.empty(P.shape, P.dtype)
+    with np.errstate(all="ignore"):
+        for part in blocks(len(P), P.shape[-1], prod(P.shape[2:-1])):
+            W = out[..., part]
+            _factor(P[..., part], W)
+            _square(W)
+    return out
 
 
 def sweep(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -100,69 +108,88 @@ def sweep(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     The margin is the smallest pivot relative to its diagonal entry, NaN or negative for a bad matrix:
     `margin > tolerance` is `is_positive_definite(P, tolerance)`.
     """
-    out = np.empty(P.shape, P.dtype)
-    det, margin = np.empty(P.shape[2:], P.dtype), np.empty(P.shape[2:], P.dtype)
-    copies = prod(P.shape[2:-1])
+    out, det, margin = np.empty(P.shape, P.dtype), np.empty(P.shape[2:], P.dtype), np.empty(P.shape[2:], P.dtype)
     with np.errstate(all="ignore"):
-        for part in blocks(len(P), P.shape[-1], copies):
-            _sweep(P[..., part], out[..., part], det[..., part], margin[..., part])
+        for part in blocks(len(P), P.shape[-1], prod(P.shape[2:-1])):
+            W = out[..., part]
+            _factor(P[..., part], W, det[..., part])
+            relative = np.reciprocal(_diagonal(W))
+            relative /= np.abs(_diagonal(P[..., part]))
+            np.minimum.reduce(relative, axis=0, out=margin[..., part])
+            _square(W)
     return out, det, margin
+
+
+def inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """P^-1 (n, n, B), det P (B,) and its least reciprocal pivot (B,), which is positive if all pivots are.
+
+    For callers who look at the condition of P, and need no margin.
+    """
+    out, det, least = np.empty(P.shape, P.dtype), np.empty(P.shape[2:], P.dtype), np.empty(P.shape[2:], P.dtype)
+    with np.errstate(all="ignore"):
+        for part in blocks(len(P), P.shape[-1], prod(P.shape[2:-1])):
+            W = out[..., part]
+            _factor(P[..., part], W, det[..., part])
+            np.minimum.reduce(_diagonal(W), axis=0, out=least[..., part])
+            _square(W)
+    return out, det, least
 
 
 def trace_inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     """tr P^-1 (B,) and det P (B,)."""
-    trace, det, margin = (np.empty(P.shape[2:], P.dtype) for _ in range(3))
+    trace, det = np.empty(P.shape[2:], P.dtype), np.empty(P.shape[2:], P.dtype)
     with np.errstate(all="ignore"):
         for part in blocks(len(P), P.shape[-1], prod(P.shape[2:-1])):
-            W, r = _factor(P[..., part], det[..., part], margin[..., part])
-            trace[..., part] = r[0]
+            W = np.empty(P[..., part].shape, P.dtype)
+            _factor(P[..., part], W, det[..., part])
+            trace[..., part] = W[0, 0]
             for k in range(1, len(P)):
-                square = W[k, 0] * W[k, 0]
+                square = W[0, k] * W[0, k]
                 for j in range(1, k):
-                    square += W[k, j] * W[k, j]
+                    square += W[j, k] * W[j, k]
                 square += 1.0
-                square *= r[k]
+                square *= W[k, k]
                 trace[..., part] += square
     return trace, det
 
 
-def _factor(P: FloatArray, det: FloatArray, margin: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """W = L^-1 below the diagonal, and 1 / d, of P = L diag(d) L'. Writes det and margin (see `sweep`)."""
+def _diagonal(P: FloatArray) -> FloatArray:
+    """A view, (n, B)."""
+    return P.reshape(-1, *P.shape[2:])[:: len(P) + 1] if P.flags.c_contiguous else np.moveaxis(P.diagonal(), -1, 0)
+
+
+def _factor(P: FloatArray, W: FloatArray, det: FloatArray | None = None) -> None:
+    """1 / d on the diagonal of W and L^-1' above it, of P = L diag(d) L'. Writes det P into `det`.
+
+    Below the diagonal of W the elimination is done.
+    """
     n = len(P)
-    A = np.empty(P.shape, P.dtype)
-    W = np.empty(P.shape, P.dtype)  # holds -L first
-    r = np.empty(P.shape[1:], P.dtype)
     for k in range(n):
-        S = A if k else P
-        d = S[k, k]
-        if k:
-            det *= d
-            np.minimum(margin, d / np.abs(P[k, k]), out=margin)
-        else:
-            det[...] = d
-            margin[...] = d / np.abs(d)
-        np.divide(1.0, d, out=r[k])
-        np.multiply(S[k + 1 :, k], -r[k], out=W[k + 1 :, k])
-        for i in range(k + 1, n):
-            np.add(S[i, k + 1 : i + 1], W[i, k] * S[k + 1 : i + 1, k], out=A[i, k + 1 : i + 1])
+        S = W if k else P
+        pivot = S[k, k]
+        if det is not None:
+            np.multiply(det if k else 1.0, pivot, out=det)
+        r = np.divide(1.0, pivot, out=W[k, k])
+        if k + 1 < n:
+            below = S[k + 1 :, k]
+            minus = np.multiply(below, -r, out=W[k, k + 1 :])
+            for i in range(1, n - k):
+                np.add(S[k + i, k + 1 : k + i + 1], below[:i] * minus[i - 1], out=W[k + i, k + 1 : k + i + 1])
     for i in range(2, n):
-        row = W[i, :i].copy()
         for k in range(1, i):
-            W[i, :k] += row[k] * W[k, :k]
-    return W, r
+            W[:k, i] += W[:k, k] * W[k, i]
 
 
-def _sweep(P: FloatArray, out: FloatArray, det: FloatArray, margin: FloatArray) -> None:
-    """P^-1 = W' D^-1 W with W = L^-1, as LAPACK's potri does it."""
-    W, r = _factor(P, det, margin)
-    for k in range(len(P)):
-        scaled = W[k, :k] * r[k]
-        out[k, :k] = scaled
-        out[k, k] = r[k]
+def _square(W: FloatArray) -> None:
+    """P^-1 = W' D^-1 W from `_factor`, in place, as LAPACK's potri does it."""
+    n = len(W)
+    for k in range(1, n):
+        column = W[:k, k]
+        scaled = np.multiply(column, W[k, k], out=W[k, :k])
         for i in range(k):
-            out[i, : i + 1] += scaled[i] * W[k, : i + 1]
-    for i in range(1, len(P)):
-        out[:i, i] = out[i, :i]
+            W[i, : i + 1] += scaled[i] * column[: i + 1]
+    for i in range(1, n):
+        W[:i, i] = W[i, :i]
 
 
 def ldl(P: FloatArray) -> tuple[FloatArray, FloatArray]:

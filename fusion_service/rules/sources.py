@@ -19,15 +19,15 @@ class Sources:
     information: FloatArray  # (n, n, N, B), the inverses
     dets: FloatArray  # (N, B), of the covariances
     condition: FloatArray  # (B,), see `condition`
-    definite: NDArray[np.bool_]  # (B,), every covariance is positive definite
+    definite: NDArray[np.bool_]  # (B,), every covariance is positive definite and of condition < 1e14
 
     @classmethod
     def of(cls, means: FloatArray, covariances: FloatArray) -> Self:
         """From the layout of `fuse_last`: means (N, n, B), covariances (N, n, n, B)."""
         P = covariances.transpose(1, 2, 0, 3)
-        A, dets, margin = linalg.sweep(P)
-        worst, least = condition(P, A).max(axis=0), margin.min(axis=0)
-        definite = least > 1e-14
+        A, dets, least = linalg.inverse_det(P)
+        worst = np.maximum.reduce(condition(P, A), axis=0)
+        definite = (np.minimum.reduce(least, axis=0) > 0.0) & (worst < 1e14)
         if not definite.all():
             P = np.where(definite, P, np.nan)  # stops every iteration at once
             A = np.where(definite, A, np.nan)
@@ -91,11 +91,15 @@ def weighted_sum(A: FloatArray, scale: FloatArray | None = None) -> FloatArray:
 
 def weighted_mean(sources: Sources, scale: FloatArray | None = None) -> FloatArray:
     """sum_i scale_i P_i^-1 (x_i - x_0), (n, B)."""
-    A, x = sources.information, sources.spread
-    y = np.zeros_like(x[:, 0])
+    A, x = sources.information, sources.means
+    if sources.count == 1:
+        return np.zeros_like(x[:, 0])
+    y: FloatArray
     for i in range(1, sources.count):
-        term = linalg.matvec(A[:, :, i], x[:, i])
-        y += term if scale is None else term * scale[i]
+        term = linalg.matvec(A[:, :, i], x[:, i] - x[:, 0])
+        if scale is not None:
+            term *= scale[i]
+        y = term if i == 1 else np.add(y, term, out=y)
     return y
 
 
@@ -106,5 +110,6 @@ def weighted_product(sources: Sources, scale: FloatArray | None) -> tuple[FloatA
     """
     M = weighted_sum(sources.information, scale)
     P = linalg.inverse(M)
-    mean = sources.means[:, 0] + linalg.matvec(P, weighted_mean(sources, scale))
+    mean = linalg.matvec(P, weighted_mean(sources, scale))
+    mean += sources.means[:, 0]
     return mean, P, np.maximum(sources.condition, condition(M, P))
