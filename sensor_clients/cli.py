@@ -20,13 +20,14 @@ from sensor_clients.events import Event, Scenario
 from sensor_clients.playback import autoferry
 from sensor_clients.publisher import TrackPublisher, TruthPublisher
 from sensor_clients.runner import pace
-from sensor_clients.scenarios.three_radars import three_radars
+from sensor_clients.scenarios.three_radars import TRACKERS, three_radars
 
 __all__ = ["main"]
 
 EXAMPLES = """examples:
   sensor-client list
   sensor-client simulate three-radars --sensor radar1
+  sensor-client simulate three-radars --sensor radar2 --tracker imm
   sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
 """
@@ -63,6 +64,7 @@ def _parser() -> argparse.ArgumentParser:
     simulate = _command(commands, "simulate", "simulate a sensor and its local tracker", EXAMPLES)
     simulate.add_argument("scenario", help="three-radars")
     simulate.add_argument("--seed", type=_whole, default=0, help="seed of noise and clutter (default 0)")
+    simulate.add_argument("--tracker", choices=TRACKERS, default="ckf", help="of the radars (default ckf); see list")
     simulate.set_defaults(run=_simulate)
     playback = _command(commands, "playback", "play recorded returns through a local tracker", EXAMPLES)
     playback.add_argument("scenario", help="autoferry:N, N one of " + ", ".join(map(str, autoferry.SCENARIOS)))
@@ -105,6 +107,7 @@ def _whole(text: str) -> int:
 
 def _list(_: argparse.Namespace) -> int:
     print(_describe(three_radars(), "simulate three-radars"))
+    print("  trackers: " + "; ".join(f"{name}, {what}" for name, what in TRACKERS.items()))
     print()
     print(f"playback autoferry:N  N in {', '.join(map(str, autoferry.SCENARIOS))}: {autoferry.SUMMARY}")
     print(f"  sensors: {', '.join(autoferry.SENSORS)}, truth; needs --data or FUSION_DATA")
@@ -125,7 +128,7 @@ def _table(parameters: Sequence[Sequence[str]]) -> str:
 def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.scenario != "three-radars":
         raise UsageError(f"no simulated scenario {arguments.scenario!r}; known: three-radars")
-    return _publish(three_radars(), arguments, arguments.seed)
+    return _publish(three_radars(arguments.tracker), arguments, arguments.seed)
 
 
 def _playback(arguments: argparse.Namespace) -> int:

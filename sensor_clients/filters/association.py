@@ -24,7 +24,7 @@ import numpy as np
 from fusion_service import linalg
 from sensor_clients.filters.measurement import Floats, Prediction
 
-__all__ = ["Association", "associate", "likelihood", "update"]
+__all__ = ["Association", "associate", "gate_probability", "likelihood", "update"]
 
 
 class Association(NamedTuple):
@@ -37,14 +37,21 @@ class Association(NamedTuple):
     unused: Floats
 
 
+def gate_probability(gate: float, d: int) -> float:
+    """That a return of `d` components, 1 or 2, lies within the squared Mahalanobis distance `gate`."""
+    return 1 - math.exp(-gate / 2) if d == 2 else math.erf(math.sqrt(gate / 2))
+
+
 def likelihood(prediction: Prediction, gate: float) -> Floats:
     """Density l_ij (T, M) of return j under track i, 0 beyond `gate` (squared Mahalanobis distance).
 
-    Divided by the probability 1 - exp(-gate/2) of the gate of a 2-D return, so that it integrates to 1.
+    Divided by the probability of the gate, so that it integrates to 1.
     """
     nu, S = prediction.innovations, linalg.inverse(prediction.covariance)
-    distance = S[0, 0, :, None] * nu[0] ** 2 + 2 * S[0, 1, :, None] * nu[0] * nu[1] + S[1, 1, :, None] * nu[1] ** 2
-    scale = (2 * math.pi) * np.sqrt(linalg.det(prediction.covariance)) * (1 - math.exp(-gate / 2))
+    distance = S[0, 0, :, None] * nu[0] ** 2
+    if len(nu) == 2:
+        distance = distance + 2 * S[0, 1, :, None] * nu[0] * nu[1] + S[1, 1, :, None] * nu[1] ** 2
+    scale = np.sqrt((2 * math.pi) ** len(nu) * linalg.det(prediction.covariance)) * gate_probability(gate, len(nu))
     return np.where(distance < gate, np.exp(-0.5 * np.minimum(distance, gate)), 0.0) / scale[:, None]
 
 

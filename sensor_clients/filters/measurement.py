@@ -1,8 +1,9 @@
 """Measurement models of local trackers, and the predicted measurement by linearisation or cubature.
 
 States are `STATE` = (x, y, vx, vy) in m and m/s, batch last: means (4, T), covariances (4, 4, T); returns
-are (2, M). A model says how a position shows up in a return; `predict_measurement` gives the moments that
-an EKF or a CKF update needs, `Sigma` being the square root of P and K = P_xz S^-1:
+are (d, M), d = 2 but for a bearing, which has d = 1. A model says how a position shows up in a return;
+`predict_measurement` gives the moments that an EKF or a CKF update needs, `Sigma` being the square root of P and
+K = P_xz S^-1:
 
     EKF   z = h(x),               S = H P H' + R,                           P_xz = P H'
     CKF   z = sum_i h(X_i) / 2n,  S = sum_i (h(X_i)-z)(h(X_i)-z)' / 2n + R, P_xz = sum_i (X_i-x)(h(X_i)-z)' / 2n
@@ -29,7 +30,7 @@ STATE = ("x", "y", "vx", "vy")
 
 
 class Prediction(NamedTuple):
-    """Predicted returns: mean z (2, T), covariance S (2, 2, T), gain K (4, 2, T), innovations (2, T, M)."""
+    """Predicted returns: mean z (d, T), covariance S (d, d, T), gain K (4, d, T), innovations (d, T, M)."""
 
     mean: Floats
     covariance: Floats
@@ -38,22 +39,22 @@ class Prediction(NamedTuple):
 
 
 class MeasurementModel(Protocol):
-    """How a place (2, ...), m, shows up in a return (2, ...)."""
+    """How a place (2, ...), m, shows up in a return (d, ...)."""
 
     def observe(self, place: Floats) -> Floats:
-        """The noiseless return h(place), same shape."""
+        """The noiseless return h(place), (d, ...)."""
 
     def jacobian(self, place: Floats) -> Floats:
-        """dh/dplace (2, 2, T) for places (2, T)."""
+        """dh/dplace (d, 2, T) for places (2, T)."""
 
     def noise(self, place: Floats) -> Floats:
-        """Covariance R (2, 2, T) of the noise of a return from places (2, T)."""
+        """Covariance R (d, d, T) of the noise of a return from places (2, T)."""
 
     def difference(self, a: Floats, b: Floats) -> Floats:
         """a - b for returns, angles wrapped to [-pi, pi)."""
 
     def locate(self, returns: Floats) -> tuple[Floats, Floats]:
-        """Mean (2, M) and covariance (2, 2, M) of the place given a return (2, M) alone."""
+        """Mean (2, M) and covariance (2, 2, M) of the place given a return (d, M) alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +139,7 @@ def predict_measurement(
 ) -> Prediction:
     """Moments of the return of each track, and the innovation of each return for each track.
 
-    means (n, T), covariances (n, n, T) with x, y first; returns (2, M); `cubature`: CKF, else EKF.
+    means (n, T), covariances (n, n, T) with x, y first; returns (d, M); `cubature`: CKF, else EKF.
     """
     n, T = means.shape
     place = np.ascontiguousarray(means[:2])
@@ -148,7 +149,7 @@ def predict_measurement(
         centre = model.observe(place)
         offsets = np.concatenate([spread, -spread], axis=1)
         points = np.ascontiguousarray(means[:2, None] + offsets[:2]).reshape(2, -1)
-        seen = model.observe(points).reshape(2, 2 * n, T)
+        seen = model.observe(points).reshape(len(centre), 2 * n, T)
         seen = model.difference(seen, np.broadcast_to(centre[:, None], seen.shape))
         shift = seen.mean(axis=1)
         seen = seen - shift[:, None]
@@ -162,6 +163,6 @@ def predict_measurement(
         S = np.einsum("ijt,jkt->ikt", H, cross[:2]) + model.noise(place)
     S = linalg.symmetrise(S)
     gain = np.einsum("ijt,jkt->ikt", cross, linalg.inverse(S))
-    shape = (2, T, returns.shape[1])
+    shape = (len(z), T, returns.shape[1])
     innovations = model.difference(np.broadcast_to(returns[:, None], shape), np.broadcast_to(z[:, :, None], shape))
     return Prediction(z, S, gain, innovations)

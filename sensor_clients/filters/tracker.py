@@ -15,18 +15,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg, motion
 from schemas import Motion
-from sensor_clients.filters.association import associate, likelihood, update
+from sensor_clients.filters.association import Association, associate, gate_probability, likelihood, update
 from sensor_clients.filters.measurement import STATE, Floats, MeasurementModel, predict_measurement
 
 __all__ = ["LocalTracker", "Report", "TrackerConfig"]
-
-COLUMNS = ("ids", "means", "covariances", "existence", "first", "farthest", "born", "updated", "confirmed")
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +56,9 @@ class TrackerConfig:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Report:
-    """Confirmed tracks at one time: ids (T,) u64, means (T, 4), covariances (T, 4, 4), existence (T,),
-    updated (T,) i64 time of the last scan in which the track probably was seen, ns."""
+    """Confirmed tracks at one time: ids (T,) u64, means (C, 4), covariances (C, 4, 4), existence (T,),
+    updated (T,) i64 time of the last scan in which the track probably was seen, ns. C = T, but for mixtures,
+    which have counts (T,) u16 components each with weights (C,)."""
 
     time: int
     ids: NDArray[np.uint64]
@@ -66,6 +66,15 @@ class Report:
     covariances: Floats
     existence: Floats
     updated: NDArray[np.int64]
+    counts: NDArray[np.uint16] | None = None
+    weights: Floats | None = None
+
+    def fields(self) -> dict[str, Any]:
+        """What `TrackPublisher.tracks` takes of it."""
+        names = ("ids", "means", "covariances", "existence", "updated", "counts", "weights")
+        return {"space": STATE, "complete": True} | {
+            name: value for name in names if (value := getattr(self, name)) is not None
+        }
 
 
 class LocalTracker:
@@ -75,6 +84,11 @@ class LocalTracker:
     covariances (4, 4, T), existence (T,); first (2, T): where it started; farthest (T,): how far from there
     it has been, m, less two standard deviations; born, updated (T,) i64 ns; confirmed (T,).
     """
+
+    columns: ClassVar[tuple[str, ...]] = (
+        *("ids", "means", "covariances", "existence"),
+        *("first", "farthest", "born", "updated", "confirmed"),
+    )
 
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
@@ -93,9 +107,7 @@ class LocalTracker:
     def predict(self, time: int) -> None:
         """Move all tracks on to `time`, ns. ValueError if that is back in time."""
         dt = 0.0 if self.time is None else (time - self.time) * 1e-9
-        self.means, self.covariances = motion.predict(
-            self.config.motion, STATE, self.means, self.covariances, np.full(len(self.ids), dt)
-        )
+        self._move(dt)
         self.existence = self.existence * self.config.survival**dt
         self.time = time
 
@@ -115,19 +127,13 @@ class LocalTracker:
         Returns the probability (M,) that each return is of no reported track."""
         config = self.config
         self.predict(time)
-        p = detection(self.means[:2])
-        self._keep(p > 0)
-        p = p[p > 0] * (1 - math.exp(-config.gate / 2))
-        prediction = predict_measurement(model, self.means, self.covariances, returns, config.cubature)
-        found = associate(likelihood(prediction, config.gate), self.existence, p, clutter + birth)
-        self.means, self.covariances = update(self.means, self.covariances, prediction, found.weights, found.missed)
+        found = self._correct(returns, model, clutter + birth, detection)
         self.existence = found.existence
         claimed = np.where(self.reported(), found.existence, 0.0) @ found.weights
         self.updated = np.where(found.missed < 0.5, time, self.updated)
         self._prune()
         self._start(returns, model, found.unused * birth / (clutter + birth))
-        way = np.hypot(*(self.means[:2] - self.first)) - 2 * self._worst_sigma()
-        self.farthest = np.maximum(self.farthest, way)
+        self.farthest = np.maximum(self.farthest, self._way(model))
         self.confirmed = self.confirmed | (self.existence >= config.confirm)
         return np.asarray(1.0 - claimed)
 
@@ -155,19 +161,49 @@ class LocalTracker:
             self.updated[chosen],
         )
 
+    def _move(self, dt: float) -> None:
+        """Predict the densities by `dt` s."""
+        self.means, self.covariances = motion.predict(
+            self.config.motion, STATE, self.means, self.covariances, np.full(len(self.ids), dt)
+        )
+
+    def _correct(
+        self, returns: Floats, model: MeasurementModel, intensity: Floats, detection: Callable[[Floats], Floats]
+    ) -> Association:
+        """End the tracks that cannot be seen, associate the returns with the others and update their densities."""
+        config = self.config
+        p = detection(self.means[:2])
+        self._keep(p > 0)
+        p = p[p > 0] * gate_probability(config.gate, len(returns))
+        prediction = predict_measurement(model, self.means, self.covariances, returns, config.cubature)
+        found = associate(likelihood(prediction, config.gate), self.existence, p, intensity)
+        self.means, self.covariances = update(self.means, self.covariances, prediction, found.weights, found.missed)
+        return found
+
+    def _born(self, returns: Floats, model: MeasurementModel) -> dict[str, Any]:
+        """The columns of the densities of new tracks, one from each return (d, M)."""
+        means, covariances = self._still(*model.locate(returns))
+        return {"means": means, "covariances": covariances}
+
+    def _still(self, place: Floats, spread: Floats) -> tuple[Floats, Floats]:
+        """States (4, M) of mean velocity 0 at `place` (2, M), and covariances (4, 4, M) given its `spread`."""
+        covariances = np.zeros((4, 4, *place.shape[1:]))
+        covariances[:2, :2] = spread
+        covariances[2, 2] = covariances[3, 3] = self.config.sigma_speed**2
+        return np.concatenate([place, np.zeros_like(place)]), covariances
+
+    def _way(self, model: MeasurementModel) -> Floats:
+        """How far (T,) each track surely is from where it started, m."""
+        return np.asarray(np.hypot(*(self.means[:2] - self.first)) - 2 * self._worst_sigma())
+
     def _start(self, returns: Floats, model: MeasurementModel, existence: Floats) -> None:
         chosen = existence >= self.config.drop_tentative
         count = int(chosen.sum())
-        place, spread = model.locate(np.ascontiguousarray(returns[:, chosen]))
-        covariances = np.zeros((4, 4, count))
-        covariances[:2, :2] = spread
-        covariances[2, 2] = covariances[3, 3] = self.config.sigma_speed**2
-        new = {
+        born = self._born(np.ascontiguousarray(returns[:, chosen]), model)
+        new = born | {
             "ids": np.arange(self._next, self._next + count),
-            "means": np.concatenate([place, np.zeros((2, count))]),
-            "covariances": covariances,
             "existence": existence[chosen],
-            "first": place,
+            "first": born["means"][:2],
             "farthest": np.zeros(count),
             "born": np.full(count, self.time, dtype=np.int64),
             "updated": np.full(count, self.time, dtype=np.int64),
@@ -198,5 +234,5 @@ class LocalTracker:
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         if not chosen.all():
-            for name in COLUMNS:
+            for name in self.columns:
                 setattr(self, name, getattr(self, name)[..., chosen])

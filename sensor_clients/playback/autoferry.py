@@ -19,7 +19,6 @@ import numpy as np
 
 from schemas import Disk, Enu, Height
 from sensor_clients.events import Event, Parameter, Scenario
-from sensor_clients.filters import STATE
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback.harbour import LIDAR, RADAR, HarbourSensor, HarbourTracker
 
@@ -101,22 +100,8 @@ def sensor_events(sensor: HarbourSensor, scans: list[Scan], seed: int = 0) -> It
             told = scan.own
             yield Event(scan.time, "info", _info(sensor, scan.own))
         tracker.step(scan.time, scan.own, scan.returns)
-        report = tracker.report(scan.time)
-        yield Event(
-            scan.time,
-            "tracks",
-            {
-                "space": STATE,
-                "frame": PIREN,
-                "height": Height(PIREN.alt, 0.0),
-                "ids": report.ids,
-                "means": report.means,
-                "covariances": report.covariances,
-                "existence": report.existence,
-                "updated": report.updated,
-                "complete": True,
-            },
-        )
+        fields = tracker.report(scan.time).fields()
+        yield Event(scan.time, "tracks", {"frame": PIREN, "height": Height(PIREN.alt, 0.0)} | fields)
 
 
 def _info(sensor: HarbourSensor, own: Floats) -> dict[str, Any]:

@@ -24,10 +24,20 @@ import numpy as np
 from fusion_service import geodesy
 from schemas import Disk, Ecef, Enu, Height, Motion
 from sensor_clients.events import Event, Parameter, Scenario
-from sensor_clients.filters import STATE, LocalTracker, RangeAzimuth, TrackerConfig
+from sensor_clients.filters import ImmTracker, LocalTracker, Modes, RangeAzimuth, TrackerConfig
 from sensor_clients.filters.measurement import Floats
 
-__all__ = ["PARAMETERS", "RADARS", "TARGETS", "Radar", "radar_events", "scan", "three_radars", "true_states"]
+__all__ = [
+    "PARAMETERS",
+    "RADARS",
+    "TARGETS",
+    "TRACKERS",
+    "Radar",
+    "radar_events",
+    "scan",
+    "three_radars",
+    "true_states",
+]
 
 START = 1_767_225_600 * 10**9
 """2026-01-01T00:00:00Z, ns."""
@@ -97,6 +107,12 @@ TRACKER = TrackerConfig(
     max_sigma=5e3,
     merge=4.0,
 )
+MODES = Modes(intensities=(0.02, 10.0), sojourns=(120.0, 20.0))
+TRACKERS = {
+    "ckf": "a CKF for each track",
+    "imm": "an IMM for each track, its two modes published as a mixture",
+}
+"""The local trackers a radar can have."""
 
 PARAMETERS = (
     Parameter("targets, radars", "20, 3", "Sharma, Table 3"),
@@ -111,6 +127,8 @@ PARAMETERS = (
     Parameter("detection probability", f"{RADAR.detection:g}", "chosen"),
     Parameter("false returns per scan", f"{RADAR.clutter:g}, Poisson, uniform in range and azimuth", "chosen"),
     Parameter("process noise intensity", f"{TRACKER.motion.q:g} m2/s3", "chosen"),
+    Parameter("of the IMM's modes", " and ".join(f"{q:g}" for q in MODES.intensities) + " m2/s3", "chosen"),
+    Parameter("mean time in each mode", " and ".join(f"{tau:g}" for tau in MODES.sojourns) + " s", "chosen"),
     Parameter("local tracker", f"CKF, joint IPDA, confirmed at existence {TRACKER.confirm:g}", "PDA: Sharma 6.4.1"),
 )
 
@@ -148,14 +166,17 @@ def scan(radar: Radar, places: Floats, rng: np.random.Generator) -> Floats:
     return rng.permutation(returns, axis=1)
 
 
-def radar_events(name: str, seed: int = 0, radar: Radar = RADAR, config: TrackerConfig = TRACKER) -> Iterator[Event]:
-    """What radar `name` says: its info, then its tracks every `REPORT_PERIOD`. The seed is that of its noise."""
+def radar_events(
+    name: str, seed: int = 0, radar: Radar = RADAR, config: TrackerConfig = TRACKER, tracker: str = "ckf"
+) -> Iterator[Event]:
+    """What radar `name` says: its info, then its tracks every `REPORT_PERIOD`, by one of `TRACKERS`. The seed is
+    that of its noise."""
     frame = RADARS[name]
     rng = np.random.default_rng([seed, list(RADARS).index(name)])
     times = np.arange(0.0, DURATION + radar.period / 2, radar.period)
     places = _in_frame(true_states(times), frame)[..., :2]
     model = RangeAzimuth(radar.sigma_range, radar.sigma_azimuth)
-    tracker = LocalTracker(config)
+    local = ImmTracker(config, MODES) if tracker == "imm" else LocalTracker(config)
 
     def detection(place: Floats) -> Floats:
         return np.where(np.hypot(place[0], place[1]) < radar.field_of_view, radar.detection, 0.0)
@@ -164,7 +185,7 @@ def radar_events(name: str, seed: int = 0, radar: Radar = RADAR, config: Tracker
         "frame": frame,
         "position": (0.0, 0.0, 0.0),
         "period": REPORT_PERIOD,
-        "motion": config.motion,
+        "motion": MODES.motion() if tracker == "imm" else config.motion,
         "coverage": Disk(radar.field_of_view),
         "detection_probability": radar.detection,
         "initiation_delay": 3 * radar.period + REPORT_PERIOD,
@@ -174,24 +195,9 @@ def radar_events(name: str, seed: int = 0, radar: Radar = RADAR, config: Tracker
         time = START + round(t * SECOND)
         returns = scan(radar, at.T, rng)
         clutter, birth = (np.full(returns.shape[1], radar.per_unit(number)) for number in (radar.clutter, radar.births))
-        tracker.step(time, returns, model, clutter, birth, detection)
+        local.step(time, returns, model, clutter, birth, detection)
         if t % REPORT_PERIOD == 0:
-            report = tracker.report()
-            yield Event(
-                time,
-                "tracks",
-                {
-                    "space": STATE,
-                    "frame": frame,
-                    "height": Height(0.0, 0.0),
-                    "ids": report.ids,
-                    "means": report.means,
-                    "covariances": report.covariances,
-                    "existence": report.existence,
-                    "updated": report.updated,
-                    "complete": True,
-                },
-            )
+            yield Event(time, "tracks", {"frame": frame, "height": Height(0.0, 0.0)} | local.report().fields())
 
 
 def truth_events(period: float = RADAR.period) -> Iterator[Event]:
@@ -211,9 +217,9 @@ def truth_events(period: float = RADAR.period) -> Iterator[Event]:
         )
 
 
-@lru_cache(maxsize=1)
-def three_radars() -> Scenario:
-    """The scenario as the command line knows it."""
+@lru_cache
+def three_radars(tracker: str = "ckf") -> Scenario:
+    """The scenario as the command line knows it, each radar with one of `TRACKERS`."""
     return Scenario(
         name="three-radars",
         summary="three radars, twenty targets and heavy clutter over 300 s (Sharma 6.4)",
@@ -221,6 +227,6 @@ def three_radars() -> Scenario:
         duration=DURATION,
         origin="simulated",
         parameters=PARAMETERS,
-        sensors={name: partial(radar_events, name) for name in RADARS},
+        sensors={name: partial(radar_events, name, tracker=tracker) for name in RADARS},
         truth=truth_events,
     )
