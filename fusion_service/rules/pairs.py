@@ -1,9 +1,13 @@
 """The best weight of two sources, for a whole block of pairs at once.
 
-Along one weight t, det M(t) and trace adj M(t) are polynomials of degree n (one more with a spread term):
-their values at a few nodes give them, and a bracketed Newton iteration on the polynomials finds the best
-t in a few passes over rows of scalars. Meant for n <= `LIMIT`: beyond, interpolation loses too many
-digits, and `simplex` does the work.
+Along one weight t, det M(t) and trace adj M(t) are polynomials of degree n (one more with a spread term).
+Their values at both ends, what the inverses there tell of their slopes, and values at a few nodes between
+give them. Meant for n <= `LIMIT`: beyond, interpolation loses too many digits, and `simplex` does the work.
+
+For det and a plain sum, det M = sum e_k t^k (1-t)^(n-k) with all e_k >= 0, and with u = t / (1-t) the best t
+is where q(u) = sum ((k+1) e_(k+1) - (n-k) e_k) u^k = 0, k < n. det M(u) has only real roots, so q has too
+(Laguerre's theorem on the polar derivative), and at most one of them is positive: Laguerre's method goes
+there from anywhere. For the rest a bracketed Newton iteration on the polynomials finds the best t.
 
 The caller certifies the answer with `simplex.gap`, so a lost digit is noticed. An element is frozen when
 it has converged: its bits do not depend on the others.
@@ -15,13 +19,15 @@ from functools import cache
 import numpy as np
 
 from .. import linalg
-from ..linalg import FloatArray
+from ..linalg import FloatArray, total
 
 LIMIT = 6
 ROUNDS = 60
 FLAT = 1e-10
 """Relative slope below which a criterion does not care: the weight stays at a half."""
 DONE = 1e-11
+CLOSE = 3e-5
+"""A relative step of Laguerre's method after which the error, about its cube, is nothing."""
 
 
 Ends = tuple[FloatArray, FloatArray]
@@ -38,30 +44,136 @@ def best_weight(
     """
     n, size = M[0].shape[0], M[0].shape[-1]
     degree = n + (bump is not None)
-    nodes, to_coefficients = _nodes(degree)
-    det, adjugate = np.empty((2, degree + 1, 1, size))
-    det[0, 0], det[-1, 0] = dets
-    t = nodes[1:-1, None]
-    between = np.empty((n, n, degree - 1, size))
-    difference = M[1] - M[0]
-    for i in range(n):
-        between[i, : i + 1] = t * difference[i, : i + 1, None]
-        between[i, : i + 1] += M[0][i, : i + 1, None]
-        if bump is not None:
-            between[i, : i + 1] += (t * (1.0 - t)) * (bump[: i + 1] * bump[i])[:, None]
+    first, last = linalg.inner(inverses[0], M[1]) - n, n - linalg.inner(inverses[1], M[0])  # slopes of log det
+    if bump is not None:
+        first += _form(inverses[0], bump)
+        last -= _form(inverses[1], bump)
+    slopes = min(2 if criterion == "det" else 1, degree - 1)
+    t = _nodes(degree - 1 - slopes)
+    between = _between(M, bump, t)
+    det = np.empty((degree + 1, 1, size))
+    det[:2, 0] = dets
+    for row, slope, value in zip(det[2 : 2 + slopes, 0], (first, last), dets, strict=False):
+        np.multiply(slope, value, out=row)
     if criterion == "det":
-        det[1:-1, 0] = linalg.det(between)
-        return _newton(_det_slope, to_coefficients, det, n, rho)
-    adjugate[1:-1, 0], det[1:-1, 0] = linalg.trace_inverse_det(between)
-    adjugate[0, 0], adjugate[-1, 0] = linalg.trace(inverses[0]), linalg.trace(inverses[1])
-    return _newton(_trace_slope, to_coefficients, np.concatenate([det, adjugate * det], axis=1), n, rho)
+        if len(t):
+            det[2 + slopes :, 0] = linalg.det(between)
+        if bump is None and rho == 1.0:
+            q = _combine(_polar(n, slopes), det[:, 0])
+            np.multiply(first, dets[0], out=q[0])
+            np.multiply(last, dets[1], out=q[-1])
+            return _laguerre(q, first, last)
+        ends = ((first + n) / rho - rho * n, rho * n - (n - last) / rho) if rho < 1.0 else (first, last)
+        return _newton(_det_slope, _combine(_monomials(degree, slopes), det), n, rho, ends)
+    adjugate = np.empty((2 + len(t), 1, size))
+    for row, inverse, value in zip(adjugate[:2, 0], inverses, dets, strict=True):
+        np.multiply(linalg.trace(inverse), value, out=row)
+    if len(t):
+        adjugate[2:, 0], det[2 + slopes :, 0] = linalg.trace_inverse_det(between)
+        adjugate[2:] *= det[2 + slopes :]
+    c = np.zeros((degree + 1, 2, size))
+    c[:, :1] = _combine(_monomials(degree, slopes), det)
+    c[: len(adjugate), 1:] = _combine(_monomials(len(adjugate) - 1, 0), adjugate)
+    return _newton(_trace_slope, c, n, rho)
+
+
+def _between(M: Ends, bump: FloatArray | None, t: FloatArray) -> FloatArray:
+    """M(t) at some nodes (K,), for rho = 1: lower triangles (n, n, K, B)."""
+    n, size = M[0].shape[0], M[0].shape[-1]
+    t = t[:, None]
+    out = np.empty((n, n, len(t), size))
+    for i in range(n if len(t) else 0):
+        row = out[i, : i + 1]
+        np.multiply(M[0][i, : i + 1, None], 1.0 - t, out=row)
+        row += t * M[1][i, : i + 1, None]
+        if bump is not None:
+            row += (t * (1.0 - t)) * (bump[: i + 1] * bump[i])[:, None]
+    return out
+
+
+def _form(A: FloatArray, x: FloatArray) -> FloatArray:
+    """x' A x (B,)."""
+    return total(linalg.matvec(A, x) * x)
 
 
 @cache
-def _nodes(degree: int) -> tuple[FloatArray, FloatArray]:
-    """Chebyshev-Lobatto nodes on [0, 1] and the matrix from values there to coefficients in z = 2t - 1."""
-    z = -np.cos(np.pi * np.arange(degree + 1) / degree)
-    return 0.5 + 0.5 * z, np.linalg.inv(np.vander(z, increasing=True))
+def _nodes(count: int) -> FloatArray:
+    """The inner Chebyshev-Lobatto nodes of [0, 1]."""
+    return 0.5 - 0.5 * np.cos(np.pi * np.arange(1, count + 1) / (count + 1))
+
+
+@cache
+def _monomials(degree: int, slopes: int) -> FloatArray:
+    """From values at 0 and 1, so many slopes there, and values at `_nodes` to coefficients in z = 2t - 1."""
+    t = np.array([0.0, 1.0, *_nodes(degree - 1 - slopes)])
+    rows = list(np.vander(2.0 * t - 1.0, degree + 1, increasing=True))
+    k = np.arange(degree + 1)
+    rows[2:2] = [2.0 * k * (-1.0) ** (k + 1), 2.0 * k][:slopes]
+    return np.linalg.inv(np.array(rows))
+
+
+@cache
+def _polar(n: int, slopes: int) -> FloatArray:
+    """From the same to the coefficients of q(u)."""
+    k = np.arange(n + 1)
+    t = np.array([0.0, 1.0, *_nodes(n - 1 - slopes)])[:, None]
+    rows = list(t**k * (1.0 - t) ** (n - k))
+    rows[2:2] = [1.0 * (k == 1) - n * (k == 0), 1.0 * n * (k == n) - (k == n - 1)][:slopes]
+    e = np.linalg.inv(np.array(rows))
+    out: FloatArray = k[1:, None] * e[1:] - (n - k[:-1, None]) * e[:-1]
+    return out
+
+
+def _combine(matrix: FloatArray, values: FloatArray) -> FloatArray:
+    columns = matrix.reshape(*matrix.shape, *(1,) * (values.ndim - 1))
+    out: FloatArray = columns[:, 0] * values[0]
+    for k in range(1, len(values)):
+        out += columns[:, k] * values[k]
+    return out
+
+
+def _laguerre(q: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
+    """t where q(u) (n, B) is zero; the better end if nowhere, a half if it is flat."""
+    steep = (first > FLAT) | (last < -FLAT)
+    inside = steep & (first > 0.0) & (last < 0.0)
+    out = np.where(steep, np.where(last >= 0.0, 1.0, 0.0), 0.5)
+    todo = np.flatnonzero(inside)
+    if not len(todo):
+        return out
+    whole = len(todo) == len(out)
+    u, q = (first / -last, q) if whole else ((first[todo] / -last[todo]), q[:, todo])
+    m = len(q) - 1
+    for _ in range(ROUNDS):
+        value, slope, bend = q[m] * u, q[m], None
+        value += q[m - 1]
+        for k in range(m - 2, -1, -1):
+            bend = slope if bend is None else bend * u + slope
+            slope = slope * u
+            slope += value
+            value *= u
+            value += q[k]
+        if bend is None:
+            root: FloatArray | float = 0.0
+        else:
+            square = slope * slope
+            square *= m - 1.0
+            value *= 2.0 * m
+            square -= value * bend
+            square *= m - 1.0
+            root = np.sqrt(np.maximum(square, 0.0, out=square), out=square)
+            value *= 0.5 / m
+        step = value
+        step *= m
+        step /= root - slope
+        u = u + step
+        busy = np.abs(step) > CLOSE * u
+        left = np.count_nonzero(busy)
+        if left < len(u):
+            out[todo] = u / (1.0 + u)
+            if not left:
+                break
+            todo, u, q = todo[busy], u[busy], q[:, busy]
+    return out
 
 
 def _with_derivatives(c: FloatArray) -> FloatArray:
@@ -133,19 +245,19 @@ def _log_ratio(t: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
 Slope = Callable[[FloatArray, FloatArray, int, float], tuple[FloatArray, FloatArray]]
 
 
-def _newton(slope: Slope, to_coefficients: FloatArray, values: FloatArray, n: int, rho: float) -> FloatArray:
+def _newton(slope: Slope, c: FloatArray, n: int, rho: float, ends: tuple[FloatArray, ...] = ()) -> FloatArray:
     """Where in [0, 1] a falling slope passes zero; the better end if nowhere, a half if it is flat.
 
-    `values` (degree + 1, k, B): of the polynomials at the nodes.
+    `c` (degree + 1, k, B): coefficients of the polynomials; `ends`: the slope at 0 and 1 where it is known.
     """
-    c = to_coefficients[:, 0, None, None] * values[0]
-    for column, row in zip(to_coefficients.T[1:], values[1:], strict=True):
-        c += column[:, None, None] * row
     size = c.shape[-1]
-    three = np.zeros((3, size))
-    three[1], three[2] = 0.5, 1.0
     c = _with_derivatives(c)
-    (zero, half, one), _ = slope(three, c[..., None, :], n, rho)
+    if ends:
+        (zero, one), (half, _) = ends, slope(np.full(size, 0.5), c, n, rho)
+    else:
+        three = np.zeros((3, size))
+        three[1], three[2] = 0.5, 1.0
+        (zero, half, one), _ = slope(three, c[..., None, :], n, rho)
     steep = (zero > FLAT) | (one < -FLAT)
     lo, hi = np.where(half > 0.0, 0.5, 0.0), np.where(half > 0.0, 1.0, 0.5)
     # start where (a + b t) / (1 + c t) through the three values is zero: it can follow a pole

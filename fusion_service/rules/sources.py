@@ -92,14 +92,10 @@ def weighted_sum(A: FloatArray, scale: FloatArray | None = None) -> FloatArray:
 def weighted_mean(sources: Sources, scale: FloatArray | None = None) -> FloatArray:
     """sum_i scale_i P_i^-1 (x_i - x_0), (n, B)."""
     A, x = sources.information, sources.means
-    if sources.count == 1:
-        return np.zeros_like(x[:, 0])
-    y: FloatArray
+    y = np.zeros_like(x[:, 0])
     for i in range(1, sources.count):
         term = linalg.matvec(A[:, :, i], x[:, i] - x[:, 0])
-        if scale is not None:
-            term *= scale[i]
-        y = term if i == 1 else np.add(y, term, out=y)
+        y += term if scale is None else term * scale[i]
     return y
 
 
