@@ -1,18 +1,236 @@
-"""Gaussian mixtures of many tracks as arrays: components in rows, `counts` says how many each track has."""
+"""Gaussian mixtures as arrays: one (`Mixture`) or one per track for many tracks at once (`Mixtures`).
+
+    f(x) = sum_c w_c N(x; m_c, P_c)
+
+The sum of the weights is the mass: 1 for a probability density, the expected number for an intensity.
+`Mixtures` is batch-last (see `linalg`), padded to the most components with weight 0, and keeps log weights,
+so that a product of densities that hardly overlap does not vanish. No element's bits depend on the others.
+
+First-order powers and products follow Li-2nd (49)-(51); merging Salmond (1990) and Runnalls (2007).
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-__all__ = ["moments"]
+from . import linalg
+from .linalg import FloatArray, total
 
-Floats = NDArray[np.float64]
+__all__ = [
+    "DensityError",
+    "Mixture",
+    "Mixtures",
+    "draws",
+    "halved_sum",
+    "log_gaussian",
+    "log_sum",
+    "merged",
+    "moments",
+    "power_product",
+    "reduce_mixture",
+    "reduce_mixtures",
+    "sampled_moments",
+]
+
+METHODS = ("runnalls", "salmond", "truncate")
+LOG_2PI = float(np.log(2.0 * np.pi))
+
+
+class DensityError(ValueError):
+    """What is no mixture, or a reduction that cannot be done: one line that says what and why."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mixture:
+    """One Gaussian mixture, checked and copied. Raises DensityError for what is none."""
+
+    weights: FloatArray
+    """(C,), not negative, with a positive sum; that of a density is 1"""
+    means: FloatArray
+    """(C, n)"""
+    covariances: FloatArray
+    """(C, n, n), symmetric positive definite"""
+
+    def __post_init__(self) -> None:
+        for name in ("weights", "means", "covariances"):
+            try:
+                value = np.array(getattr(self, name), dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise DensityError(f"{name} are not an array of numbers: {error}") from None
+            if not np.isfinite(value).all():
+                raise DensityError(f"{name} are not finite")
+            value.setflags(write=False)
+            object.__setattr__(self, name, value)
+        w, x, P = self.weights, self.means, self.covariances
+        if w.ndim != 1 or x.ndim != 2 or not x.size or len(w) != len(x) or P.shape != (*x.shape, x.shape[1]):
+            raise DensityError(f"weights {w.shape}, means {x.shape}, covariances {P.shape}: expected C, C n, C n n")
+        if not ((w >= 0.0).all() and w.sum() > 0.0):
+            raise DensityError("weights must not be negative and must have a positive sum")
+        scale = np.sqrt(np.abs(np.einsum("cii->ci", P)))
+        if (np.abs(P - P.swapaxes(1, 2)) > 1e-9 * scale[:, :, None] * scale[:, None, :]).any():
+            raise DensityError("a covariance is not symmetric")
+        if not linalg.is_positive_definite(linalg.to_last(P, 2)).all():
+            raise DensityError("a covariance is not positive definite")
+
+    @property
+    def mass(self) -> float:
+        """Sum of the weights."""
+        return float(self.weights.sum())
+
+    def log_pdf(self, x: ArrayLike) -> FloatArray:
+        """log f (...) at x (..., n)."""
+        points = np.asarray(x, dtype=np.float64)
+        flat = linalg.to_last(points, 1)
+        return Mixtures.of([self]).log_pdf(flat[..., None])[:, 0].reshape(points.shape[:-1])
+
+    def pdf(self, x: ArrayLike) -> FloatArray:
+        """f (...) at x (..., n)."""
+        return np.asarray(np.exp(self.log_pdf(x)))
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (n,) and covariance (n, n) of the normalised density."""
+        mean, covariance = Mixtures.of([self]).moments()
+        return mean[:, 0], covariance[..., 0]
+
+    def draw(self, size: int, seed: int) -> FloatArray:
+        """Samples (size, n) of the normalised density."""
+        rng = np.random.default_rng(seed)
+        which = rng.choice(len(self.weights), size=size, p=self.weights / self.mass)
+        z = rng.standard_normal((size, self.means.shape[1]))
+        out: FloatArray = self.means[which]
+        L = np.linalg.cholesky(self.covariances)
+        for c in range(len(L)):
+            at = which == c
+            out[at] += z[at] @ L[c].T
+        return out
+
+
+@dataclass(frozen=True, slots=True)
+class Mixtures:
+    """B mixtures of up to C components, batch-last; trusted. Padding has log weight -inf and finite moments."""
+
+    log_weights: FloatArray
+    """(C, B)"""
+    means: FloatArray
+    """(n, C, B)"""
+    covariances: FloatArray
+    """(n, n, C, B)"""
+
+    @classmethod
+    def of(cls, mixtures: Sequence[Mixture]) -> Mixtures:
+        """One batch of mixtures of one state dimension."""
+        if len({m.means.shape[1] for m in mixtures}) != 1:
+            raise DensityError("one batch needs mixtures of one state dimension")
+        counts = np.array([len(m.weights) for m in mixtures])
+        weights, means, P = (
+            np.concatenate([getattr(m, name) for m in mixtures]) for name in ("weights", "means", "covariances")
+        )
+        return cls.from_rows(weights, means, P, counts)
+
+    @classmethod
+    def from_rows(
+        cls, weights: FloatArray, means: FloatArray, covariances: FloatArray, counts: NDArray[np.integer]
+    ) -> Mixtures:
+        """From components in rows (R,), (R, n), (R, n, n), the first counts[0] >= 1 of them the first track's."""
+        sizes = np.asarray(counts, dtype=np.intp)
+        step = np.arange(sizes.max(initial=1))[:, None]
+        rows = np.cumsum(sizes) - sizes + np.minimum(step, sizes - 1)
+        with np.errstate(divide="ignore"):
+            log_weights = np.where(step < sizes, np.log(weights)[rows], -np.inf)
+        return cls(
+            log_weights,
+            np.ascontiguousarray(means[rows].transpose(2, 0, 1)),
+            np.ascontiguousarray(covariances[rows].transpose(2, 3, 0, 1)),
+        )
+
+    def rows(self) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.uint16]]:
+        """The inverse of `from_rows`, padding left out."""
+        keep = ~np.isneginf(self.log_weights.T)
+        return (
+            np.exp(self.log_weights.T[keep]),
+            self.means.transpose(2, 1, 0)[keep],
+            self.covariances.transpose(3, 2, 0, 1)[keep],
+            keep.sum(axis=1).astype(np.uint16),
+        )
+
+    def __len__(self) -> int:
+        return int(self.log_weights.shape[1])
+
+    def __getitem__(self, index: int) -> Mixture:
+        weights, means, covariances, _ = self.take(np.array([index])).rows()
+        return Mixture(weights, means, covariances)
+
+    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Mixtures:
+        """The mixtures at `index`."""
+        return Mixtures(self.log_weights[:, index], self.means[..., index], self.covariances[..., index])
+
+    @property
+    def weights(self) -> FloatArray:
+        """(C, B)."""
+        return np.asarray(np.exp(self.log_weights))
+
+    @property
+    def log_mass(self) -> FloatArray:
+        """Log of the sum of the weights (B,)."""
+        return log_sum(self.log_weights)
+
+    def scaled(self, log_factor: FloatArray) -> Mixtures:
+        """Every mixture times exp(log_factor (B,))."""
+        return Mixtures(self.log_weights + log_factor, self.means, self.covariances)
+
+    def normalised(self) -> Mixtures:
+        """Every mixture scaled to mass 1."""
+        return self.scaled(-self.log_mass)
+
+    def moments(self) -> tuple[FloatArray, FloatArray]:
+        """Mean (n, B) and covariance (n, n, B) of the normalised densities."""
+        w = np.exp(self.log_weights - self.log_mass)
+        first = self.means[:, :1]
+        mean = total((w * (self.means - first)).swapaxes(0, 1)) + first[:, 0]
+        d = self.means - mean[:, None]
+        spread = w * (self.covariances + linalg.outer(d, d))
+        return mean, total(np.moveaxis(spread, 2, 0))
+
+    def log_pdf(self, x: FloatArray) -> FloatArray:
+        """log f (S, B) at x (n, S, B), or at the same points x (n, S, 1) for all."""
+        L, d = linalg.ldl(self.covariances)
+        parts = [
+            self.log_weights[c] + log_gaussian(x - self.means[:, None, c], L[:, :, None, c], d[:, None, c])
+            for c in range(len(self.log_weights))
+        ]
+        return log_sum(np.stack(parts))
+
+
+def log_sum(logs: FloatArray) -> FloatArray:
+    """log sum exp over the first axis, in its order; -inf where there is nothing."""
+    top = logs.max(axis=0)
+    top = np.where(np.isfinite(top), top, 0.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(top + np.log(total(np.exp(logs - top))))
+
+
+def log_gaussian(offset: FloatArray, L: FloatArray, d: FloatArray) -> FloatArray:
+    """log N(offset; 0, L diag(d) L') for offset (n, ...), L (n, n, ...), d (n, ...) of `linalg.ldl`, broadcast."""
+    n = len(offset)
+    rows: list[FloatArray] = []
+    square: FloatArray = np.zeros(())
+    with np.errstate(all="ignore"):
+        for k in range(n):
+            row = offset[k]
+            for j in range(k):
+                row = row - L[k, j] * rows[j]
+            rows.append(row)
+            square = square + row * row / d[k]
+        return -0.5 * (square + total(np.log(d)) + n * LOG_2PI)
 
 
 def moments(
-    means: Floats, covariances: Floats, weights: Floats | None, counts: NDArray[np.uint16] | None
-) -> tuple[Floats, Floats]:
+    means: FloatArray, covariances: FloatArray, weights: FloatArray | None, counts: NDArray[np.uint16] | None
+) -> tuple[FloatArray, FloatArray]:
     """Mean (T, n) and covariance (T, n, n) of each track's mixture of `counts` (T,) components.
 
     means (C, n), covariances (C, n, n), weights (C,), which sum to 1 per track up to rounding and are
@@ -29,3 +247,198 @@ def moments(
         offset = means - np.repeat(mean, sizes, axis=0)
         spread = covariances + offset[:, :, None] * offset[:, None, :]
         return mean, np.add.reduceat(share[:, None, None] * spread, starts)
+
+
+def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
+    """prod_i f_i^{powers_i}, each power to first order: of a sum the sum of the powers (Li-2nd (49)-(51)).
+
+    powers (N, B), not negative. Components: one for each choice of a component from every source, the last
+    source's running fastest. Exact where a power is 1 or a mixture has one component. Between 0 and 1 the first
+    order drops the cross terms and is too large, everywhere: (a + b)^w <= a^w + b^w. A power of 0 is the factor 1.
+    """
+    N, n, B = len(sources), len(sources[0].means), len(sources[0])
+    sizes = [len(f.log_weights) for f in sources]
+    factors = []
+    with np.errstate(all="ignore"):
+        for i, (f, w) in enumerate(zip(sources, powers, strict=True)):
+            A, det, _ = linalg.sweep(f.covariances)
+            log_weights = w * (f.log_weights - 0.5 * (np.log(det) + n * LOG_2PI))
+            only = np.where(np.arange(len(A[0, 0]))[:, None] == 0, 0.0, -np.inf)
+            log_weights = np.where(w > 0.0, np.where(f.log_weights > -np.inf, log_weights, -np.inf), only)
+            shape = [1] * i + [sizes[i]] + [1] * (N - 1 - i) + [B]
+            factors.append((log_weights.reshape(shape), f.means.reshape(n, *shape), (w * A).reshape(n, n, *shape)))
+        first = factors[0][1]
+        everything = (*sizes, B)
+        log_weights = np.zeros(everything)
+        information, y = np.zeros((n, n, *everything)), np.zeros((n, *everything))
+        for i, (own, x, A) in enumerate(factors):
+            log_weights = log_weights + own
+            information += A
+            if i:
+                y += linalg.matvec(np.broadcast_to(A, information.shape), x - first)
+        P, det, _ = linalg.sweep(information)
+        offset = linalg.matvec(P, y)
+        log_weights += 0.5 * (n * LOG_2PI - np.log(det))
+        for _, x, A in factors:
+            d = first + offset - x
+            log_weights -= 0.5 * total(d * linalg.matvec(np.broadcast_to(A, information.shape), d))
+    return Mixtures(log_weights.reshape(-1, B), (first + offset).reshape(n, -1, B), P.reshape(n, n, -1, B))
+
+
+def draws(n: int, samples: int, seed: int) -> FloatArray:
+    """About `samples` seeded standard normal vectors (n, S), S even, in pairs z and -z, with exactly unit covariance.
+
+    So the mean and the covariance of a Gaussian come out exactly, and the error of other moments is smaller.
+    """
+    half = np.random.default_rng(seed).standard_normal((n, max(samples // 2, n + 1)))
+    L = np.linalg.cholesky(half @ half.T / half.shape[1])
+    z = np.linalg.solve(L, half)
+    return np.concatenate([z, -z], axis=1)
+
+
+def sampled_moments(
+    means: FloatArray, covariances: FloatArray, log_ratio: Callable[[FloatArray], FloatArray], z: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Log mass (B,), mean (n, B) and covariance (n, n, B) of exp(log_ratio(x)) N(x; means, covariances).
+
+    Importance sampling from the Gaussians (n, B), (n, n, B) themselves at the `draws` z (n, S), self-normalised
+    (Sharma (59), (60)); log_ratio takes x (n, S, B) and returns (S, B). Unbiased where the ratio is bounded, up to
+    the 1/S of a ratio of averages.
+    """
+    n, S = z.shape
+    L, d = linalg.ldl(covariances)
+    step = linalg.matvec(L[:, :, None], z[..., None] * np.sqrt(d)[:, None])
+    logs = log_ratio(means[:, None] + step)
+    top = logs.max(axis=0)
+    w = np.exp(logs - np.where(np.isfinite(top), top, 0.0))
+    mass = halved_sum(w)
+    with np.errstate(all="ignore"):
+        mean = np.stack([halved_sum(w * row) / mass for row in step])
+        covariance = np.empty_like(covariances)
+        for i in range(n):
+            weighted = w * (step[i] - mean[i])
+            for j in range(i + 1):
+                covariance[i, j] = covariance[j, i] = halved_sum(weighted * (step[j] - mean[j])) / mass
+        return top + np.log(mass / S), means + mean, covariance
+
+
+def halved_sum(a: FloatArray) -> FloatArray:
+    """Sum over the first axis by halves, in an order that does not depend on the batch."""
+    while len(a) > 1:
+        odd, half = len(a) % 2, len(a) // 2
+        b = a[:half] + a[half : 2 * half]
+        if odd:
+            b[0] += a[-1]
+        a = b
+    out: FloatArray = a[0]
+    return out
+
+
+def merged(
+    a: tuple[FloatArray, FloatArray, FloatArray], b: tuple[FloatArray, FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weight, mean and covariance of two weighted Gaussians, batch-last, merged with their moments kept."""
+    weight = a[0] + b[0]
+    share = b[0] / weight
+    d = b[1] - a[1]
+    spread = (share * (1.0 - share)) * linalg.outer(d, d)
+    return weight, a[1] + share * d, a[2] + share * (b[2] - a[2]) + spread
+
+
+def reduce_mixture(
+    mixture: Mixture, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
+) -> Mixture:
+    """A mixture of the same mass with fewer components.
+
+    Components with a share of the mass below `prune` go (never the heaviest); then components are merged in pairs,
+    mean and covariance kept, until `max_components` are left. The next pair is that with the least
+
+    * "runnalls": bound of the divergence of the merged from the unmerged density, for components a, b merged to ab
+      ((w_a + w_b) log det P_ab - w_a log det P_a - w_b log det P_b) / 2;
+    * "salmond": w_a w_b / (w_a + w_b) (m_a - m_b)' P^-1 (m_a - m_b), P the covariance of the whole mixture.
+
+    "truncate" merges nothing and keeps the heaviest. Components come heaviest first. Raises DensityError.
+    """
+    return reduce_mixtures(Mixtures.of([mixture]), max_components=max_components, prune=prune, method=method)[0]
+
+
+def reduce_mixtures(
+    mixtures: Mixtures, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
+) -> Mixtures:
+    """`reduce_mixture` of many at once."""
+    if method not in METHODS:
+        raise DensityError(f"method {method!r}: one of {', '.join(METHODS)}")
+    if max_components is not None and max_components < 1:
+        raise DensityError(f"max_components {max_components}: at least 1")
+    if not 0.0 <= prune < 1.0:
+        raise DensityError(f"prune {prune}: a share of the mass from 0 to below 1")
+    log_mass = mixtures.log_mass
+    order = np.argsort(-mixtures.log_weights, axis=0, kind="stable")
+    logs = np.take_along_axis(mixtures.log_weights, order, axis=0)
+    with np.errstate(invalid="ignore"):
+        kept = (logs - log_mass > np.log(prune)) if prune else logs > -np.inf
+    kept[0] = True
+    count = kept.sum(axis=0)
+    most = len(order) if method != "truncate" or max_components is None else max_components
+    width = min(int(count.max(initial=1)), most)
+    order = order[:width]
+    logs = np.where(kept, logs, -np.inf)[:width]
+    x = np.take_along_axis(mixtures.means, order[None], axis=1)
+    P = np.take_along_axis(mixtures.covariances, order[None, None], axis=2)
+    with np.errstate(all="ignore"):
+        w = np.exp(logs - log_sum(logs))
+        if max_components is not None and width > max_components:
+            _merge(w, x, P, np.minimum(count, width), max_components, method)
+            order = np.argsort(-w, axis=0, kind="stable")[:max_components]
+            w = np.take_along_axis(w, order, axis=0)
+            x = np.take_along_axis(x, order[None], axis=1)
+            P = np.take_along_axis(P, order[None, None], axis=2)
+        return Mixtures(np.log(w) + log_mass, x, P)
+
+
+def _merge(
+    weights: FloatArray, means: FloatArray, P: FloatArray, count: NDArray[np.intp], most: int, method: str
+) -> None:
+    """Merge in place down to `most` components; what is merged away keeps weight 0."""
+    C = len(weights)
+    todo = np.flatnonzero(count > most)
+    w, x, S, left = weights[:, todo], means[..., todo], P[..., todo], count[todo]
+    whole = linalg.inverse(Mixtures(np.log(w), x, S).moments()[1])
+    cost = np.full((C, C, len(todo)), np.inf)
+    logdet = linalg.logdet(S)
+
+    def costs(i: FloatArray, xi: FloatArray, Pi: FloatArray, di: FloatArray, js: slice) -> FloatArray:
+        """Of merging one component (i its weight) with those at `js`."""
+        if method == "salmond":
+            d = x[:, js] - xi[:, None]
+            out = i * w[js] / (i + w[js]) * total(d * linalg.matvec(whole[:, :, None], d))
+        else:
+            both, _, M = merged((i, xi[:, None], Pi[:, :, None]), (w[js], x[:, js], S[:, :, js]))
+            out = 0.5 * (both * linalg.logdet(M) - i * di - w[js] * logdet[js])
+        return np.where((i > 0.0) & (w[js] > 0.0), out, np.inf)
+
+    for i in range(C - 1):
+        cost[i, i + 1 :] = costs(w[i], x[:, i], S[:, :, i], logdet[i], slice(i + 1, C))
+    while len(todo):
+        at = np.arange(len(todo))
+        i, j = np.divmod(cost.reshape(C * C, -1).argmin(axis=0), C)
+        w[i, at], x[:, i, at], S[:, :, i, at] = merged(
+            (w[i, at], x[:, i, at], S[:, :, i, at]), (w[j, at], x[:, j, at], S[:, :, j, at])
+        )
+        w[j, at] = 0.0
+        logdet[i, at] = linalg.logdet(S[:, :, i, at])
+        cost[j, :, at] = np.inf
+        cost[:, j, at] = np.inf
+        left -= 1
+        done = left <= most
+        if done.any():
+            weights[:, todo[done]], means[..., todo[done]], P[..., todo[done]] = w[:, done], x[..., done], S[..., done]
+            go = ~done
+            todo, w, x, S, left, i = todo[go], w[:, go], x[..., go], S[..., go], left[go], i[go]
+            whole, cost, logdet, at = whole[..., go], cost[..., go], logdet[:, go], np.arange(len(todo))
+        if not len(todo):
+            break
+        new = costs(w[i, at], x[:, i, at], S[:, :, i, at], logdet[i, at], slice(0, C))
+        k = np.arange(C)[:, None]
+        new[i, at] = np.inf
+        cost[np.minimum(i, k), np.maximum(i, k), at] = new
