@@ -15,12 +15,12 @@ __all__ = ["Event", "Parameter", "Scenario"]
 class Event(NamedTuple):
     """One message: when it is due (scenario time, int ns UTC), which publisher method says it, and with what.
 
-    kind "info": fields of `schemas.SensorInfo`; "tracks": of `TrackPublisher.tracks` without the time;
-    "truth": of `TruthPublisher.truth` without the time.
+    kind "info": fields of `schemas.SensorInfo`; "tracks", "intensity": of the publisher's method of that name
+    without the time; "truth": of `TruthPublisher.truth` without the time.
     """
 
     time: int
-    kind: Literal["info", "tracks", "truth"]
+    kind: Literal["info", "tracks", "intensity", "truth"]
     fields: dict[str, Any]
 
 

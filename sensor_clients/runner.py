@@ -41,6 +41,8 @@ def pace(
             publisher.truth(time=event.time, **event.fields)
         elif event.kind == "info":
             publisher.info(**event.fields)
+        elif event.kind == "intensity":
+            publisher.intensity(time=event.time, **event.fields)
         else:
             publisher.tracks(time=event.time, **event.fields)
         published += 1

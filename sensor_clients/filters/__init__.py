@@ -1,6 +1,7 @@
 """Local trackers, batched over tracks (the batch axis is the last)."""
 
 from sensor_clients.filters.association import Association, associate, likelihood, update
+from sensor_clients.filters.gmphd import GmPhdFilter, PhdConfig
 from sensor_clients.filters.imm import ImmTracker, Modes
 from sensor_clients.filters.measurement import (
     STATE,
@@ -15,10 +16,12 @@ from sensor_clients.filters.tracker import LocalTracker, Report, TrackerConfig
 __all__ = [
     "STATE",
     "Association",
+    "GmPhdFilter",
     "ImmTracker",
     "LocalTracker",
     "MeasurementModel",
     "Modes",
+    "PhdConfig",
     "Position",
     "Prediction",
     "RangeAzimuth",

@@ -24,7 +24,15 @@ import numpy as np
 from fusion_service import geodesy
 from schemas import Disk, Ecef, Enu, Height, Motion
 from sensor_clients.events import Event, Parameter, Scenario
-from sensor_clients.filters import ImmTracker, LocalTracker, Modes, RangeAzimuth, TrackerConfig
+from sensor_clients.filters import (
+    GmPhdFilter,
+    ImmTracker,
+    LocalTracker,
+    Modes,
+    PhdConfig,
+    RangeAzimuth,
+    TrackerConfig,
+)
 from sensor_clients.filters.measurement import Floats
 
 __all__ = [
@@ -108,9 +116,13 @@ TRACKER = TrackerConfig(
     merge=4.0,
 )
 MODES = Modes(intensities=(0.02, 10.0), sojourns=(120.0, 20.0))
+PHD = PhdConfig(TRACKER.motion, TRACKER.survival, TRACKER.sigma_speed)
+PHD_BIRTHS = 0.25
+"""As `Radar.births`, for the GM-PHD, whose mass is directly that much too large where no target appears."""
 TRACKERS = {
     "ckf": "a CKF for each track",
     "imm": "an IMM for each track, its two modes published as a mixture",
+    "gm-phd": "a GM-PHD filter, its intensity published instead of tracks",
 }
 """The local trackers a radar can have."""
 
@@ -127,8 +139,10 @@ PARAMETERS = (
     Parameter("detection probability", f"{RADAR.detection:g}", "chosen"),
     Parameter("false returns per scan", f"{RADAR.clutter:g}, Poisson, uniform in range and azimuth", "chosen"),
     Parameter("process noise intensity", f"{TRACKER.motion.q:g} m2/s3", "chosen"),
-    Parameter("of the IMM's modes", " and ".join(f"{q:g}" for q in MODES.intensities) + " m2/s3", "chosen"),
-    Parameter("mean time in each mode", " and ".join(f"{tau:g}" for tau in MODES.sojourns) + " s", "chosen"),
+    Parameter("IMM: process noise intensities", " and ".join(f"{q:g} m2/s3" for q in MODES.intensities), "chosen"),
+    Parameter("IMM: mean time in each mode", " and ".join(f"{tau:g} s" for tau in MODES.sojourns), "chosen"),
+    Parameter("GM-PHD: births per scan", f"{PHD_BIRTHS:g}", "chosen: 15 targets in 60 scans"),
+    Parameter("GM-PHD: components", f"prune {PHD.prune:g}, merge {PHD.merge:g}, at most {PHD.cap}", "chosen"),
     Parameter("local tracker", f"CKF, joint IPDA, confirmed at existence {TRACKER.confirm:g}", "PDA: Sharma 6.4.1"),
 )
 
@@ -169,13 +183,14 @@ def scan(radar: Radar, places: Floats, rng: np.random.Generator) -> Floats:
 def radar_events(
     name: str, seed: int = 0, radar: Radar = RADAR, config: TrackerConfig = TRACKER, tracker: str = "ckf"
 ) -> Iterator[Event]:
-    """What radar `name` says: its info, then its tracks every `REPORT_PERIOD`, by one of `TRACKERS`. The seed is
-    that of its noise."""
+    """What radar `name` says: its info, then its tracks or intensity every `REPORT_PERIOD`, by one of `TRACKERS`. The
+    seed is that of its noise."""
     frame = RADARS[name]
     rng = np.random.default_rng([seed, list(RADARS).index(name)])
     times = np.arange(0.0, DURATION + radar.period / 2, radar.period)
     places = _in_frame(true_states(times), frame)[..., :2]
     model = RangeAzimuth(radar.sigma_range, radar.sigma_azimuth)
+    phd, births = GmPhdFilter(PHD), PHD_BIRTHS if tracker == "gm-phd" else radar.births
     local = ImmTracker(config, MODES) if tracker == "imm" else LocalTracker(config)
 
     def detection(place: Floats) -> Floats:
@@ -194,10 +209,14 @@ def radar_events(
     for t, at in zip(times, places, strict=True):
         time = START + round(t * SECOND)
         returns = scan(radar, at.T, rng)
-        clutter, birth = (np.full(returns.shape[1], radar.per_unit(number)) for number in (radar.clutter, radar.births))
-        local.step(time, returns, model, clutter, birth, detection)
+        clutter, birth = (np.full(returns.shape[1], radar.per_unit(number)) for number in (radar.clutter, births))
+        (phd if tracker == "gm-phd" else local).step(time, returns, model, clutter, birth, detection)
         if t % REPORT_PERIOD == 0:
-            yield Event(time, "tracks", {"frame": frame, "height": Height(0.0, 0.0)} | local.report().fields())
+            where = {"frame": frame, "height": Height(0.0, 0.0)}
+            if tracker == "gm-phd":
+                yield Event(time, "intensity", where | phd.report())
+            else:
+                yield Event(time, "tracks", where | local.report().fields())
 
 
 def truth_events(period: float = RADAR.period) -> Iterator[Event]:
