@@ -1,0 +1,48 @@
+"""Which places a sensor covers, by its own word (disk, sector or polygon; WIRE.md, sensor_info)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.geodesy import FrameError, transform
+from schemas import Disk, Frame, Sector, SensorInfo
+
+__all__ = ["covers"]
+
+Floats = NDArray[np.float64]
+
+
+def covers(info: SensorInfo, positions: Floats, frame: Frame) -> NDArray[np.bool_]:
+    """Whether each place, positions (2 or 3, M) in `frame`, m, is covered: (M,).
+
+    Nothing is covered by a sensor that states no coverage, or whose frame cannot be reached from `frame`.
+    """
+    count = positions.shape[1]
+    if info.coverage is None:
+        return np.zeros(count, dtype=np.bool_)
+    axes = ("x", "y", "z")[: len(positions)]
+    try:
+        means, _ = transform(positions.T, np.zeros((count, len(axes), len(axes))), axes, frame, info.frame)
+    except FrameError:
+        return np.zeros(count, dtype=np.bool_)
+    x, y = means[:, 0], means[:, 1]
+    if isinstance(info.coverage, (Disk, Sector)):
+        east, north = x - info.position[0], y - info.position[1]
+        distance = np.hypot(east, north)
+        inside = (distance >= info.coverage.inner) & (distance <= info.coverage.radius)
+        if isinstance(info.coverage, Sector):
+            off = np.arctan2(east, north) - info.coverage.azimuth
+            inside &= np.abs(np.arctan2(np.sin(off), np.cos(off))) <= info.coverage.width / 2
+        return np.asarray(inside)
+    return _in_polygon(info.coverage.points, x, y)
+
+
+def _in_polygon(points: tuple[tuple[float, float], ...], x: Floats, y: Floats) -> NDArray[np.bool_]:
+    """Even-odd rule: an odd number of edges lies to the right of the place."""
+    inside = np.zeros(len(x), dtype=np.bool_)
+    for (x1, y1), (x2, y2) in zip(points, (*points[1:], points[0]), strict=True):
+        if y1 != y2:
+            between = (y1 > y) != (y2 > y)
+            inside ^= between & (x < x1 + (y - y1) * (x2 - x1) / (y2 - y1))
+    return inside
