@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from . import linalg
-from .divergence import chernoff_discrete
+from .densities import chernoff_discrete
 from .linalg import FloatArray
 
 __all__ = [

@@ -246,9 +246,10 @@ def test_sampled_moments_against_a_grid() -> None:
     mean = (grid * target).sum() * step / mass
     variance = ((grid - mean) ** 2 * target).sum() * step / mass
     z = draws(1, 40_000, seed=2)
-    log_mass, m, P = sampled_moments(
+    log_mass, m, P, effective = sampled_moments(
         np.array([[1.0]]), np.array([[[4.0]]]), lambda x: np.asarray(-np.log(np.cosh(x[0] - 2.0))), z
     )
+    assert 0.0 < effective[0] < z.shape[1]
     assert np.exp(log_mass[0]) == pytest.approx(mass, rel=0.01)  # standard errors: 0.003 of the mass,
     assert m[0, 0] == pytest.approx(mean, abs=0.03)  # 0.01
     assert P[0, 0, 0] == pytest.approx(variance, rel=0.05)  # and 0.015 of the variance

@@ -10,8 +10,9 @@ from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import binom
 from strategies import dimensions, seeds, sources
 
-from fusion_service.densities import Mixture, Mixtures
-from fusion_service.divergence import (
+from fusion_service.densities import (
+    Mixture,
+    Mixtures,
     chernoff_discrete,
     chernoff_gaussians,
     chernoff_mixtures,

@@ -18,9 +18,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from . import linalg
-from .densities import LOG_2PI, Mixture, Mixtures, draws, halved_sum, log_gaussian, log_sum
-from .linalg import FloatArray, total
+from .. import linalg
+from ..linalg import FloatArray, total
+from .mixture import LOG_2PI, Mixture, Mixtures, log_gaussian, log_sum
+from .sampling import draws, halved_sum
 
 __all__ = ["chernoff_discrete", "chernoff_gaussians", "chernoff_mixtures", "kl_bounds", "kl_gaussians"]
 

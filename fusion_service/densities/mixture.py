@@ -1,4 +1,4 @@
-"""Gaussian mixtures as arrays: one (`Mixture`) or one per track for many tracks at once (`Mixtures`).
+"""Gaussian mixtures as arrays: one (`Mixture`), or one per track for many tracks at once (`Mixtures`).
 
     f(x) = sum_c w_c N(x; m_c, P_c)
 
@@ -6,37 +6,30 @@ The sum of the weights is the mass: 1 for a probability density, the expected nu
 `Mixtures` is batch-last (see `linalg`), padded to the most components with weight 0, and keeps log weights,
 so that a product of densities that hardly overlap does not vanish. No element's bits depend on the others.
 
-First-order powers and products follow Li-2nd (49)-(51); merging Salmond (1990) and Runnalls (2007).
+First-order powers and products follow Li-2nd (49)-(51).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import linalg
-from .linalg import FloatArray, total
+from .. import linalg
+from ..linalg import FloatArray, total
 
 __all__ = [
     "DensityError",
     "Mixture",
     "Mixtures",
-    "draws",
-    "halved_sum",
     "log_gaussian",
     "log_sum",
-    "merged",
     "moments",
     "power_product",
-    "reduce_mixture",
-    "reduce_mixtures",
-    "sampled_moments",
 ]
 
-METHODS = ("runnalls", "salmond", "truncate")
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -146,6 +139,17 @@ class Mixtures:
             np.ascontiguousarray(means[rows].transpose(2, 0, 1)),
             np.ascontiguousarray(covariances[rows].transpose(2, 3, 0, 1)),
         )
+
+    @classmethod
+    def joined(cls, parts: Sequence[Mixtures]) -> Mixtures:
+        """One batch of several."""
+        C = max(len(p.log_weights) for p in parts)
+        wide = []
+        for p in parts:
+            index = np.minimum(np.arange(C), len(p.log_weights) - 1)
+            logs = np.where((np.arange(C) < len(p.log_weights))[:, None], p.log_weights[index], -np.inf)
+            wide.append((logs, p.means[:, index], p.covariances[:, :, index]))
+        return cls(*(np.concatenate(arrays, axis=-1) for arrays in zip(*wide, strict=True)))
 
     def rows(self) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.uint16]]:
         """The inverse of `from_rows`, padding left out."""
@@ -283,162 +287,3 @@ def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
             d = first + offset - x
             log_weights -= 0.5 * total(d * linalg.matvec(np.broadcast_to(A, information.shape), d))
     return Mixtures(log_weights.reshape(-1, B), (first + offset).reshape(n, -1, B), P.reshape(n, n, -1, B))
-
-
-def draws(n: int, samples: int, seed: int) -> FloatArray:
-    """About `samples` seeded standard normal vectors (n, S), S even, in pairs z and -z, with exactly unit covariance.
-
-    So the mean and the covariance of a Gaussian come out exactly, and the error of other moments is smaller.
-    """
-    half = np.random.default_rng(seed).standard_normal((n, max(samples // 2, n + 1)))
-    L = np.linalg.cholesky(half @ half.T / half.shape[1])
-    z = np.linalg.solve(L, half)
-    return np.concatenate([z, -z], axis=1)
-
-
-def sampled_moments(
-    means: FloatArray, covariances: FloatArray, log_ratio: Callable[[FloatArray], FloatArray], z: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Log mass (B,), mean (n, B) and covariance (n, n, B) of exp(log_ratio(x)) N(x; means, covariances).
-
-    Importance sampling from the Gaussians (n, B), (n, n, B) themselves at the `draws` z (n, S), self-normalised
-    (Sharma (59), (60)); log_ratio takes x (n, S, B) and returns (S, B). Unbiased where the ratio is bounded, up to
-    the 1/S of a ratio of averages.
-    """
-    n, S = z.shape
-    L, d = linalg.ldl(covariances)
-    step = linalg.matvec(L[:, :, None], z[..., None] * np.sqrt(d)[:, None])
-    logs = log_ratio(means[:, None] + step)
-    top = logs.max(axis=0)
-    w = np.exp(logs - np.where(np.isfinite(top), top, 0.0))
-    mass = halved_sum(w)
-    with np.errstate(all="ignore"):
-        mean = np.stack([halved_sum(w * row) / mass for row in step])
-        covariance = np.empty_like(covariances)
-        for i in range(n):
-            weighted = w * (step[i] - mean[i])
-            for j in range(i + 1):
-                covariance[i, j] = covariance[j, i] = halved_sum(weighted * (step[j] - mean[j])) / mass
-        return top + np.log(mass / S), means + mean, covariance
-
-
-def halved_sum(a: FloatArray) -> FloatArray:
-    """Sum over the first axis by halves, in an order that does not depend on the batch."""
-    while len(a) > 1:
-        odd, half = len(a) % 2, len(a) // 2
-        b = a[:half] + a[half : 2 * half]
-        if odd:
-            b[0] += a[-1]
-        a = b
-    out: FloatArray = a[0]
-    return out
-
-
-def merged(
-    a: tuple[FloatArray, FloatArray, FloatArray], b: tuple[FloatArray, FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Weight, mean and covariance of two weighted Gaussians, batch-last, merged with their moments kept."""
-    weight = a[0] + b[0]
-    share = b[0] / weight
-    d = b[1] - a[1]
-    spread = (share * (1.0 - share)) * linalg.outer(d, d)
-    return weight, a[1] + share * d, a[2] + share * (b[2] - a[2]) + spread
-
-
-def reduce_mixture(
-    mixture: Mixture, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
-) -> Mixture:
-    """A mixture of the same mass with fewer components.
-
-    Components with a share of the mass below `prune` go (never the heaviest); then components are merged in pairs,
-    mean and covariance kept, until `max_components` are left. The next pair is that with the least
-
-    * "runnalls": bound of the divergence of the merged from the unmerged density, for components a, b merged to ab
-      ((w_a + w_b) log det P_ab - w_a log det P_a - w_b log det P_b) / 2;
-    * "salmond": w_a w_b / (w_a + w_b) (m_a - m_b)' P^-1 (m_a - m_b), P the covariance of the whole mixture.
-
-    "truncate" merges nothing and keeps the heaviest. Components come heaviest first. Raises DensityError.
-    """
-    return reduce_mixtures(Mixtures.of([mixture]), max_components=max_components, prune=prune, method=method)[0]
-
-
-def reduce_mixtures(
-    mixtures: Mixtures, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
-) -> Mixtures:
-    """`reduce_mixture` of many at once."""
-    if method not in METHODS:
-        raise DensityError(f"method {method!r}: one of {', '.join(METHODS)}")
-    if max_components is not None and max_components < 1:
-        raise DensityError(f"max_components {max_components}: at least 1")
-    if not 0.0 <= prune < 1.0:
-        raise DensityError(f"prune {prune}: a share of the mass from 0 to below 1")
-    log_mass = mixtures.log_mass
-    order = np.argsort(-mixtures.log_weights, axis=0, kind="stable")
-    logs = np.take_along_axis(mixtures.log_weights, order, axis=0)
-    with np.errstate(invalid="ignore"):
-        kept = (logs - log_mass > np.log(prune)) if prune else logs > -np.inf
-    kept[0] = True
-    count = kept.sum(axis=0)
-    most = len(order) if method != "truncate" or max_components is None else max_components
-    width = min(int(count.max(initial=1)), most)
-    order = order[:width]
-    logs = np.where(kept, logs, -np.inf)[:width]
-    x = np.take_along_axis(mixtures.means, order[None], axis=1)
-    P = np.take_along_axis(mixtures.covariances, order[None, None], axis=2)
-    with np.errstate(all="ignore"):
-        w = np.exp(logs - log_sum(logs))
-        if max_components is not None and width > max_components:
-            _merge(w, x, P, np.minimum(count, width), max_components, method)
-            order = np.argsort(-w, axis=0, kind="stable")[:max_components]
-            w = np.take_along_axis(w, order, axis=0)
-            x = np.take_along_axis(x, order[None], axis=1)
-            P = np.take_along_axis(P, order[None, None], axis=2)
-        return Mixtures(np.log(w) + log_mass, x, P)
-
-
-def _merge(
-    weights: FloatArray, means: FloatArray, P: FloatArray, count: NDArray[np.intp], most: int, method: str
-) -> None:
-    """Merge in place down to `most` components; what is merged away keeps weight 0."""
-    C = len(weights)
-    todo = np.flatnonzero(count > most)
-    w, x, S, left = weights[:, todo], means[..., todo], P[..., todo], count[todo]
-    whole = linalg.inverse(Mixtures(np.log(w), x, S).moments()[1])
-    cost = np.full((C, C, len(todo)), np.inf)
-    logdet = linalg.logdet(S)
-
-    def costs(i: FloatArray, xi: FloatArray, Pi: FloatArray, di: FloatArray, js: slice) -> FloatArray:
-        """Of merging one component (i its weight) with those at `js`."""
-        if method == "salmond":
-            d = x[:, js] - xi[:, None]
-            out = i * w[js] / (i + w[js]) * total(d * linalg.matvec(whole[:, :, None], d))
-        else:
-            both, _, M = merged((i, xi[:, None], Pi[:, :, None]), (w[js], x[:, js], S[:, :, js]))
-            out = 0.5 * (both * linalg.logdet(M) - i * di - w[js] * logdet[js])
-        return np.where((i > 0.0) & (w[js] > 0.0), out, np.inf)
-
-    for i in range(C - 1):
-        cost[i, i + 1 :] = costs(w[i], x[:, i], S[:, :, i], logdet[i], slice(i + 1, C))
-    while len(todo):
-        at = np.arange(len(todo))
-        i, j = np.divmod(cost.reshape(C * C, -1).argmin(axis=0), C)
-        w[i, at], x[:, i, at], S[:, :, i, at] = merged(
-            (w[i, at], x[:, i, at], S[:, :, i, at]), (w[j, at], x[:, j, at], S[:, :, j, at])
-        )
-        w[j, at] = 0.0
-        logdet[i, at] = linalg.logdet(S[:, :, i, at])
-        cost[j, :, at] = np.inf
-        cost[:, j, at] = np.inf
-        left -= 1
-        done = left <= most
-        if done.any():
-            weights[:, todo[done]], means[..., todo[done]], P[..., todo[done]] = w[:, done], x[..., done], S[..., done]
-            go = ~done
-            todo, w, x, S, left, i = todo[go], w[:, go], x[..., go], S[..., go], left[go], i[go]
-            whole, cost, logdet, at = whole[..., go], cost[..., go], logdet[:, go], np.arange(len(todo))
-        if not len(todo):
-            break
-        new = costs(w[i, at], x[:, i, at], S[:, :, i, at], logdet[i, at], slice(0, C))
-        k = np.arange(C)[:, None]
-        new[i, at] = np.inf
-        cost[np.minimum(i, k), np.maximum(i, k), at] = new

@@ -1,0 +1,146 @@
+"""Fewer components: pruning, merging (Salmond 1990, Runnalls 2007) and truncating, for many mixtures at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import linalg
+from ..linalg import FloatArray, total
+from .mixture import DensityError, Mixture, Mixtures, log_sum
+
+__all__ = ["reduce_mixture", "reduce_mixtures"]
+
+METHODS = ("runnalls", "salmond", "truncate")
+
+
+def merged(
+    a: tuple[FloatArray, FloatArray, FloatArray], b: tuple[FloatArray, FloatArray, FloatArray]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Weight, mean and covariance of two weighted Gaussians, batch-last, merged with their moments kept."""
+    weight = a[0] + b[0]
+    share = b[0] / weight
+    d = b[1] - a[1]
+    spread = (share * (1.0 - share)) * linalg.outer(d, d)
+    return weight, a[1] + share * d, a[2] + share * (b[2] - a[2]) + spread
+
+
+def reduce_mixture(
+    mixture: Mixture, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
+) -> Mixture:
+    """A mixture of the same mass with fewer components.
+
+    Components with a share of the mass below `prune` go (never the heaviest); then components are merged in pairs,
+    mean and covariance kept, until `max_components` are left. The next pair is that with the least
+
+    * "runnalls": bound of the divergence of the merged from the unmerged density, for components a, b merged to ab
+      ((w_a + w_b) log det P_ab - w_a log det P_a - w_b log det P_b) / 2;
+    * "salmond": w_a w_b / (w_a + w_b) (m_a - m_b)' P^-1 (m_a - m_b), P the covariance of the whole mixture.
+
+    "truncate" merges nothing and keeps the heaviest. Components come heaviest first. Raises DensityError.
+    """
+    return reduce_mixtures(Mixtures.of([mixture]), max_components=max_components, prune=prune, method=method)[0]
+
+
+def reduce_mixtures(
+    mixtures: Mixtures, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
+) -> Mixtures:
+    """`reduce_mixture` of many at once."""
+    if method not in METHODS:
+        raise DensityError(f"method {method!r}: one of {', '.join(METHODS)}")
+    if max_components is not None and max_components < 1:
+        raise DensityError(f"max_components {max_components}: at least 1")
+    if not 0.0 <= prune < 1.0:
+        raise DensityError(f"prune {prune}: a share of the mass from 0 to below 1")
+    log_mass = mixtures.log_mass
+    order = np.argsort(-mixtures.log_weights, axis=0, kind="stable")
+    logs = np.take_along_axis(mixtures.log_weights, order, axis=0)
+    with np.errstate(invalid="ignore"):
+        kept = (logs - log_mass > np.log(prune)) if prune else logs > -np.inf
+    kept[0] = True
+    count = kept.sum(axis=0)
+    most = len(order) if method != "truncate" or max_components is None else max_components
+    width = min(int(count.max(initial=1)), most)
+    order = order[:width]
+    logs = np.where(kept, logs, -np.inf)[:width]
+    x = np.take_along_axis(mixtures.means, order[None], axis=1)
+    P = np.take_along_axis(mixtures.covariances, order[None, None], axis=2)
+    with np.errstate(all="ignore"):
+        w = np.exp(logs - log_sum(logs))
+        if max_components is not None and width > max_components:
+            step = max(1, min((1 << 18) // (width * len(x) ** 2), (1 << 20) // width**2))
+            for i in range(0, len(mixtures), step):
+                at = slice(i, i + step)
+                _merge(w[:, at], x[..., at], P[..., at], np.minimum(count[at], width), max_components, method)
+            order = np.argsort(-w, axis=0, kind="stable")[:max_components]
+            w = np.take_along_axis(w, order, axis=0)
+            x = np.take_along_axis(x, order[None], axis=1)
+            P = np.take_along_axis(P, order[None, None], axis=2)
+        return Mixtures(np.log(w) + log_mass, x, P)
+
+
+def _merge(
+    weights: FloatArray, means: FloatArray, P: FloatArray, count: NDArray[np.intp], most: int, method: str
+) -> None:
+    """Merge in place down to `most` components; what is merged away keeps weight 0.
+
+    For every component its cheapest partner is kept, and looked for again only where it was merged.
+    """
+    C, B = weights.shape
+    todo = np.flatnonzero(count > most)
+    left = count[todo]
+    logdet = linalg.logdet(P)
+    whole = linalg.inverse(Mixtures(np.log(weights), means, P).moments()[1]) if method == "salmond" else P[:, :, 0]
+    cost = np.full((C, C, B), np.inf)
+    everyone = slice(None)
+
+    def costs(i: Any, own: Any, at: Any, js: slice) -> FloatArray:
+        """Of merging component i of the elements `own` with those in `js`; `at` is `own`, faster."""
+        w, other = weights[i, own], weights[js, at]
+        d = means[:, js, at] - means[:, i, own][:, None]
+        if method == "salmond":
+            out = w * other / (w + other) * total(d * linalg.matvec(whole[:, :, None, at], d))
+        else:
+            S, mine = P[:, :, js, at], P[:, :, i, own]
+            share = other / (w + other)
+            both = share * (1.0 - share)
+            M = np.empty_like(S)
+            for k in range(len(M)):
+                M[k, : k + 1] = (
+                    share * S[k, : k + 1] + (1.0 - share) * mine[k, : k + 1, None] + both * d[k] * d[: k + 1]
+                )
+            out = 0.5 * ((w + other) * linalg.logdet(M) - w * logdet[i, own] - other * logdet[js, at])
+        return np.where((w > 0.0) & (other > 0.0), out, np.inf)
+
+    for i in range(C - 1):
+        cost[i, i + 1 :] = cost[i + 1 :, i] = costs(i, everyone, everyone, slice(i + 1, C))
+    partner = cost.argmin(axis=1)
+    low = np.take_along_axis(cost, partner[:, None], axis=1)[:, 0]
+    while len(todo):
+        i = low[:, todo].argmin(axis=0)
+        j = partner[i, todo]
+        i, j = np.minimum(i, j), np.maximum(i, j)
+        weights[i, todo], means[:, i, todo], P[:, :, i, todo] = merged(
+            (weights[i, todo], means[:, i, todo], P[:, :, i, todo]),
+            (weights[j, todo], means[:, j, todo], P[:, :, j, todo]),
+        )
+        weights[j, todo] = 0.0
+        logdet[i, todo] = linalg.logdet(P[:, :, i, todo])
+        cost[j, :, todo] = cost[:, j, todo] = np.inf
+        low[j, todo] = np.inf
+        left -= 1
+        go = left > most
+        todo, left, i, j = todo[go], left[go], i[go], j[go]
+        new = costs(i, todo, everyone if len(todo) == B else todo, slice(0, C))
+        new[i, np.arange(len(todo))] = np.inf
+        cost[i, :, todo] = new.T
+        cost[:, i, todo] = new
+        partner[i, todo], low[i, todo] = new.argmin(axis=0), new.min(axis=0)
+        mine, best = partner[:, todo], low[:, todo]
+        nearer = new < best
+        partner[:, todo], low[:, todo] = np.where(nearer, i, mine), np.where(nearer, new, best)
+        stale, e = np.nonzero(((mine == i) | (mine == j)) & (best < np.inf) & (np.arange(C)[:, None] != i))
+        rows = cost[stale, :, todo[e]]
+        partner[stale, todo[e]], low[stale, todo[e]] = rows.argmin(axis=1), rows.min(axis=1)
