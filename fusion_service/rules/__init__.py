@@ -7,6 +7,7 @@ each rule is and what it promises.
     fused.mean, fused.covariance, fused.weights
 """
 
-from .face import RULES, Fused, Rule, RuleError, fuse, fuse_last
+from .face import Fused, fuse, fuse_last
+from .options import RuleError
+from .registry import RULES, Rule
 
-__all__ = ["RULES", "Fused", "Rule", "RuleError", "fuse", "fuse_last"]

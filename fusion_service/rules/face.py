@@ -8,10 +8,9 @@ that, and 1e-6 is enough there.
 (Where longdouble is no wider than double, everything that needs it is refused.)
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from math import prod
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,9 +18,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from .. import linalg
 from ..linalg import FloatArray
-from .harmonic import hmd_ga
-from .intersection import bci, ci
-from .product import naive
+from .options import RuleError, array, at, checked
+from .registry import FUNCTIONS, RULES
 from .simplex import GAP
 from .sources import Result, Sources
 
@@ -30,11 +28,6 @@ SAFE_CONDITION = 4e12 if np.finfo(np.longdouble).eps < 2e-19 else 0.0
 """Largest condition (see `sources.condition`) accepted in float64 and in longdouble."""
 SAFE_GAP = 1e-6
 """Optimality gap of the weights that is accepted in longdouble."""
-CRITERIA = ("det", "trace")
-
-
-class RuleError(ValueError):
-    """What a fusion was asked for cannot be done: one line that says what, where and why."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,52 +45,6 @@ class Fused:
     unless asked for with `influence=True`."""
 
 
-@dataclass(frozen=True, slots=True)
-class Rule:
-    """A fusion rule, for people and programs to choose by."""
-
-    name: str
-    promise: str
-    n_way: bool
-    options: Mapping[str, Any]
-    """Option names with their defaults."""
-    source: str
-    takes_weights: bool = True
-
-
-_FUNCTIONS: dict[str, Callable[..., Result]] = {"naive": naive, "ci": ci, "bci": bci, "hmd-ga": hmd_ga}
-
-RULES: Mapping[str, Rule] = MappingProxyType(
-    {
-        rule.name: rule
-        for rule in (
-            Rule("naive", "right only for independent tracks", True, {}, "product of the densities", False),
-            Rule(
-                "ci",
-                "conservative for every correlation",
-                True,
-                {"criterion": "det"},
-                "covariance intersection (Julier and Uhlmann 1997; Sharma (4); Li-AA)",
-            ),
-            Rule(
-                "bci",
-                "conservative for every correlation within the bound; tight for two sources",
-                True,
-                {"criterion": "det", "max_correlation": 1.0},
-                "bounded covariance inflation (Reece and Roberts 2005), N-way",
-            ),
-            Rule(
-                "hmd-ga",
-                "tight; none in general",
-                True,
-                {"criterion": "det", "constants": True},
-                "harmonic mean density, Gaussian approximation: Sharma (31), (77); Dubey (14)-(22)",
-            ),
-        )
-    }
-)
-
-
 def fuse(
     rule: str,
     means: ArrayLike,
@@ -111,13 +58,14 @@ def fuse(
 
     `means` (..., N, n), `covariances` (..., N, n, n). `weights`: None lets the rule choose (by its
     `criterion`), "uniform", or an array that broadcasts to (..., N), non-negative with sum 1. The options of
-    a rule are in `RULES[rule].options`. Identical sources come back unchanged under `ci` and `hmd-ga`.
+    a rule are in `RULES[rule].options`. Identical sources come back unchanged under `ci`,
+    `fast-ci`, `ici`, `ei`, `hmd-ga`, `aa` and `cu`; not under `naive`, `bci`, `ffcc`, `bar-shalom-campo`.
 
     Raises RuleError for an unknown rule or option, shapes or weights that do not fit, NaN or infinity, a
     covariance that is not symmetric positive definite, and input so ill-conditioned (a correlation matrix
     with a condition number beyond about 1e12) that the result could be wrong by more than 1e-6.
     """
-    x, P = _array("means", means), _array("covariances", covariances)
+    x, P = array("means", means), array("covariances", covariances)
     if x.ndim < 2 or P.ndim < 3 or x.shape != P.shape[:-1] or P.shape[-1] != P.shape[-2]:
         raise RuleError(
             f"means {x.shape} and covariances {P.shape} do not fit: expected (..., N, n) and (..., N, n, n)"
@@ -126,21 +74,21 @@ def fuse(
     if not N or not n:
         raise RuleError(f"means {x.shape}: at least one source and one component are needed")
     shape = tuple(batch)
-    function, chosen = _prepare(rule, N, options)
+    function, chosen = _prepare(rule, options, N, n, shape, last=False)
     w = _weights(rule, weights, (*shape, N))
     size = prod(shape)
     x, P = x.reshape(size, N, n), P.reshape(size, N, n, n)
     mean, covariance, out_weights = np.empty((size, n)), np.empty((size, n, n)), np.empty((size, N))
     shares = np.empty((size, N)) if influence else None
     for part in _parts(size, N, n):
-        xs, Ps = linalg.to_last(x[part], 2), linalg.to_last(P[part], 3)
+        xs, Ps = _last(x[part]), _last(P[part])
         _symmetric(Ps, part.start, shape)
-        result = _run(function, xs, Ps, None if w is None else w[part].T, influence, chosen)
+        result = _run(function, xs, Ps, None if w is None else w[part].T, influence, at(chosen, part))
         if not (np.isfinite(result.covariance[0, 0]).all() and np.isfinite(result.mean).all()):
-            raise RuleError(_complaint(xs, Ps, result, part.start, shape))
+            raise RuleError(_complaint(rule, xs, Ps, result, part.start, shape))
         count = (len(result.condition),)
-        mean[part] = linalg.to_first(result.mean, count, 1)
-        covariance[part] = linalg.to_first(result.covariance, count, 2)
+        linalg.to_first(result.mean, count, 1, mean[part])
+        linalg.to_first(result.covariance, count, 2, covariance[part])
         out_weights[part] = result.weights.T
         if shares is not None and result.influence is not None:
             shares[part] = result.influence.T
@@ -169,7 +117,7 @@ def fuse_last(
     on the others. Raises RuleError for an unknown rule or option, and nothing else.
     """
     N, n, size = means.shape
-    function, chosen = _prepare(rule, N, options)
+    function, chosen = _prepare(rule, options, N, n, (size,), last=True)
     fused = Fused(
         np.empty((n, size)),
         np.empty((n, n, size)),
@@ -178,13 +126,23 @@ def fuse_last(
     )
     for part in _parts(size, N, n):
         w = None if weights is None else weights[:, part]
-        result = _run(function, means[..., part], covariances[..., part], w, influence, chosen)
+        result = _run(function, means[..., part], covariances[..., part], w, influence, at(chosen, part))
         fused.mean[:, part] = result.mean
         fused.covariance[..., part] = result.covariance
         fused.weights[:, part] = result.weights
         if fused.influence is not None:
             fused.influence[:, part] = result.influence
     return fused
+
+
+def _last(a: FloatArray) -> FloatArray:
+    """(B, N, ...) -> (N, ..., B), in memory (..., N, B), as `Sources` has it."""
+    size, N, *core = a.shape
+    out = np.empty((*core, N, size))
+    tall, wide = a.reshape(size, N, -1), out.reshape(-1, N, size)
+    for i in range(0, size, linalg.TURN):
+        wide[..., i : i + linalg.TURN] = tall[i : i + linalg.TURN].transpose(2, 1, 0)
+    return np.moveaxis(out, -2, 0)
 
 
 def _parts(size: int, N: int, n: int) -> Iterator[slice]:
@@ -216,13 +174,14 @@ def _run(
             weights=np.array(result.weights),
             influence=share,
         )
-        at = np.flatnonzero(doubtful)
+        bad = np.flatnonzero(doubtful)
         if sources.fast:
-            w = None if weights is None else _wide(weights[:, at])
-            again = _run(function, _wide(means[..., at]), _wide(covariances[..., at]), w, influence, chosen)
-            _overwrite(result, at, again.mean, again.covariance, again.weights, again.influence)
+            w = None if weights is None else _wide(weights[:, bad])
+            x, P = _wide(means[..., bad]), _wide(covariances[..., bad])
+            again = _run(function, x, P, w, influence, at(chosen, bad))
+            _overwrite(result, bad, again.mean, again.covariance, again.weights, again.influence)
         else:
-            _overwrite(result, at, np.nan, np.nan, np.nan, np.nan)
+            _overwrite(result, bad, np.nan, np.nan, np.nan, np.nan)
         return result
 
 
@@ -239,38 +198,16 @@ def _overwrite(result: Result, at: NDArray[np.intp], mean: Any, covariance: Any,
         result.influence[:, at] = share
 
 
-def _prepare(rule: str, N: int, given: dict[str, Any]) -> tuple[Callable[..., Result], dict[str, Any]]:
+def _prepare(
+    rule: str, given: dict[str, Any], N: int, n: int, batch: tuple[int, ...], *, last: bool
+) -> tuple[Callable[..., Result], dict[str, Any]]:
     if rule not in RULES:
         raise RuleError(f"unknown rule {rule!r}: one of {', '.join(RULES)}")
     known = RULES[rule].options
     for name in given:
         if name not in known:
             raise RuleError(f"rule {rule!r} has no option {name!r}: it has {', '.join(known) or 'none'}")
-    chosen = {**known, **given}
-    if chosen.get("criterion", "det") not in CRITERIA:
-        raise RuleError(f"criterion {chosen['criterion']!r}: one of {', '.join(CRITERIA)}")
-    if "max_correlation" in chosen:
-        chosen["max_correlation"] = _bound(chosen["max_correlation"], N)
-    return _FUNCTIONS[rule], chosen
-
-
-def _bound(value: Any, N: int) -> FloatArray:
-    R = _array("max_correlation", value)
-    if R.shape not in ((), (N, N)):
-        raise RuleError(f"max_correlation has shape {R.shape}: a number or ({N}, {N}) is needed")
-    if not ((R >= 0.0) & (R <= 1.0)).all():
-        raise RuleError("max_correlation must lie between 0 and 1")
-    if R.ndim and not ((R == R.T).all() and (R.diagonal() == 1.0).all()):
-        raise RuleError("max_correlation must be symmetric with ones on its diagonal")
-    return R
-
-
-def _array(name: str, value: Any) -> FloatArray:
-    try:
-        out = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise RuleError(f"{name} are not an array of numbers: {error}") from None
-    return out
+    return FUNCTIONS[rule], checked(rule, {**known, **given}, N, n, batch, last=last)
 
 
 def _weights(rule: str, weights: ArrayLike | str | None, shape: tuple[int, ...]) -> FloatArray | None:
@@ -283,7 +220,7 @@ def _weights(rule: str, weights: ArrayLike | str | None, shape: tuple[int, ...])
         if weights != "uniform":
             raise RuleError(f'weights {weights!r}: "uniform", an array, or None to let the rule choose')
         weights = np.full(shape[-1], 1.0 / shape[-1])
-    w = _array("weights", weights)
+    w = array("weights", weights)
     try:
         w = np.broadcast_to(w, shape)
     except ValueError:
@@ -307,7 +244,9 @@ def _symmetric(P: FloatArray, start: int, batch: tuple[int, ...]) -> None:
             raise RuleError(f"covariance of {_place(source, start + element, batch)} is not symmetric")
 
 
-def _complaint(means: FloatArray, covariances: FloatArray, result: Result, start: int, batch: tuple[int, ...]) -> str:
+def _complaint(
+    rule: str, means: FloatArray, covariances: FloatArray, result: Result, start: int, batch: tuple[int, ...]
+) -> str:
     """Why an element came back as NaN."""
     definite: NDArray[np.bool_] = linalg.is_positive_definite(covariances.transpose(1, 2, 0, 3))
     for problem, bad in (
@@ -320,7 +259,7 @@ def _complaint(means: FloatArray, covariances: FloatArray, result: Result, start
             return problem.format(_place(source, start + element, batch))
     element = np.flatnonzero(~np.isfinite(result.covariance[0, 0] + result.mean[0]))[0]
     where = f"batch element {_index(start + element, batch)}" if batch else "the input"
-    return f"{where} is too ill-conditioned to fuse to within 1e-6"
+    return f"{where} {RULES[rule].refusal}"
 
 
 def _index(element: int, batch: tuple[int, ...]) -> tuple[int, ...]:

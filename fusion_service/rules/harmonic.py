@@ -114,14 +114,14 @@ def _others(sources: Sources) -> tuple[Mixture, FloatArray, FloatArray]:
         mixture = Mixture(sources.covariances[:, :, ::-1], x[:, ::-1])
         return mixture, np.zeros_like(x[0]), sources.condition
     Ax = linalg.matvec(A, x)
-    Y, y = _all_but_one(A), _all_but_one(Ax)
+    Y, y = all_but_one(A), all_but_one(Ax)
     C, det, _ = linalg.sweep(Y)
     c = linalg.matvec(C, y)
     log_z = 0.5 * (np.log(sources.dets) - np.log(det) + total(x * Ax) + total(c * y))
     return Mixture(C, c), log_z, np.maximum(sources.condition, condition(Y, C).max(axis=0))
 
 
-def _all_but_one(a: FloatArray) -> FloatArray:
+def all_but_one(a: FloatArray) -> FloatArray:
     """(..., N, B): for each source the sum over the others."""
     out = np.zeros_like(a)
     N = a.shape[-2]
@@ -141,7 +141,7 @@ def _normalised(log_w: FloatArray) -> FloatArray:
 
 def _influence(A: FloatArray, P: FloatArray, V: FloatArray, weighted: FloatArray) -> FloatArray:
     """trace(K_i) / n (N, B), K_i = P (I - V sum_{j != i} v_j C_j) A_i, weights held."""
-    X = linalg.product(linalg.product(P, V)[:, :, None], _all_but_one(weighted))
+    X = linalg.product(linalg.product(P, V)[:, :, None], all_but_one(weighted))
     mutual = linalg.trace(linalg.product(X, A))
     out: FloatArray = (inner(P[:, :, None], A) - mutual) / len(P)
     return out

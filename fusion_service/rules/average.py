@@ -1,0 +1,103 @@
+"""Arithmetic average (AA) of the densities, merged: the moments of the mixture sum w_i N(x_i, P_i).
+
+    x = sum w_i x_i,    P = sum w_i (P_i + (x_i - x)(x_i - x)')                        (Li-AA (5), (10), (11))
+
+It keeps what every source says, so one faulty source widens the result instead of pulling it away. P is
+never below CI's covariance in the sense of the densities' second moments; it grows with disagreement.
+
+Weights:
+
+* uniform, the default;
+* diversity, Li-AA (40): the largest sum w_i KL(p_i, p_AA) = (log det P_AA(w) - sum w_i log det P_i) / 2.
+  Concave in w (P_AA is concave as a matrix), so the optimum is found exactly. It is the radius of the
+  smallest KL ball around the sources: the active ones end equally far from the average, (37);
+* bound, Li-AA (45): the smallest sum w_i log(|P_i|^1/2 sum_j w_j z_ij), z_ij = N(x_i; x_j, P_i + P_j), from
+  Jensen's inequality. Not convex: for two sources the best of a scan, for more a local minimum reached from
+  equal weights (see `search`).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .. import linalg
+from ..linalg import FloatArray, inner, total
+from . import search, simplex
+from .harmonic import Mixture
+from .sources import Result, Sources
+
+
+def aa(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:
+    """Arithmetic average, merged."""
+    mixture = Mixture(sources.covariances, sources.spread)
+    w, gap, condition = weights, np.zeros_like(sources.condition), np.ones_like(sources.condition)
+    if w is None and (criterion == "uniform" or sources.count == 1):
+        w = sources.uniform
+    elif w is None and criterion == "bound":
+        w = search.lowest(_bound(sources), sources)
+    elif w is None:
+        logs = np.log(sources.dets)
+        model = Tilted(mixture, logs - total(logs) / sources.count)
+        w = simplex.best_weights("det", model, sources.uniform)
+        M, D = model(w)
+        gap, condition = simplex.gap(w, simplex.gradient("det", linalg.inverse(M), D)), sources.condition
+    return Result(
+        sources.means[:, 0] + mixture.mean(w), _full(mixture(w)[0]), w, w if influence else None, condition, gap
+    )
+
+
+def _full(P: FloatArray) -> FloatArray:
+    """Fill the upper triangle of P from the lower."""
+    for i in range(1, len(P)):
+        P[:i, i] = P[i, :i]
+    return P
+
+
+@dataclass(frozen=True, slots=True)
+class Tilted:
+    """P_AA(w) exp(-c'w / n): minus its log-determinant is c'w - log det P_AA(w), convex in w."""
+
+    mixture: Mixture
+    c: FloatArray  # (N, B)
+
+    def _scale(self, w: FloatArray) -> FloatArray:
+        out: FloatArray = np.exp(-total(self.c * w) / len(self.mixture.C))
+        return out
+
+    def __call__(self, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+        M, D = self.mixture(w)
+        s = self._scale(w)
+        M = _full(M)
+        return M * s, (D - M[:, :, None] * (self.c / len(M))) * s
+
+    def bend(self, w: FloatArray, G: FloatArray) -> FloatArray:
+        s, n = self._scale(w), len(G)
+        _, D = self.mixture(w)
+        t, lean = inner((G * s)[:, :, None], D) - 0.5 * self.c, self.c / n
+        # a multiple of ones: no matter where sum dw = 0, and a Hessian that can be inverted
+        free = n + total(t * t)
+        return self.mixture.bend(w, G * s) + lean[:, None] * t + t[:, None] * lean + free
+
+    def take(self, index: NDArray[np.bool_]) -> Self:
+        return replace(self, mixture=self.mixture.take(index), c=self.c[:, index])
+
+
+def _bound(sources: Sources) -> search.Cost:
+    """Li-AA (45)."""
+    x, P = sources.spread, sources.covariances
+    N = sources.count
+    log_z = np.empty((N, *sources.dets.shape), x.dtype)
+    for i in range(N):
+        S, d = P + P[:, :, i : i + 1], x - x[:, i : i + 1]
+        log_z[i] = -0.5 * (linalg.quadratic(S, d) + linalg.logdet(S))
+    height = log_z.max(axis=1)  # of each row: no underflow
+    z = np.exp(log_z - height[:, None])
+    offset = 0.5 * np.log(sources.dets) + height
+
+    def cost(w: FloatArray) -> FloatArray:
+        out: FloatArray = total(w * (offset + np.log(linalg.matvec(z, w))))
+        return out
+
+    return cost
