@@ -29,8 +29,8 @@ ROUNDS = 60
 DECREMENT = 1e-22
 """Squared Newton decrement below which a weight is found: about 1e-11 of a weight on a curvature of 1."""
 SWEEPS = 20
-GAP = 1e-12
-"""What log z may be above its least value with more than two sources."""
+GAP = 1e-10
+"""What log z may be above its least value, relative to its slopes, with more than two sources."""
 
 Oracle = Callable[[FloatArray, NDArray[np.intp]], tuple[FloatArray, FloatArray]]
 """Weights (N, b) of the elements at an index (b,): gradient (N, b) and Hessian (N, N, b) of log z."""
@@ -163,7 +163,7 @@ def _minimise(oracle: Oracle, N: int, B: int) -> FloatArray:
         g, H = oracle(w, todo) if N > 1 else (w, w)
         for _ in range(ROUNDS if N > 1 else 0):
             here = w[:, todo]
-            go = total(here * g) - g.min(axis=0) > GAP
+            go = total(here * g) - g.min(axis=0) > GAP * (1.0 + np.abs(g).max(axis=0))
             todo, here, g, H = todo[go], here[:, go], g[:, go], H[..., go]
             if not len(todo):
                 break

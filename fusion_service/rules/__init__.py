@@ -8,6 +8,8 @@ each rule is and what it promises.
 """
 
 from .face import Fused, fuse, fuse_last
+from .mixtures import fuse_mixtures
 from .options import RuleError
 from .registry import RULES, Rule
 
+__all__ = ["RULES", "Fused", "Rule", "RuleError", "fuse", "fuse_last", "fuse_mixtures"]
