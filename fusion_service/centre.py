@@ -34,6 +34,8 @@ from schemas import messages as words
 
 __all__ = ["FusionCentre", "Order", "Refused", "SourceFound", "SourceLost", "StepResult"]
 
+MOST_LOGGED = 8 * 2**20
+"""A checkpoint above this size is not part of the log of the first step: that mission cannot be made again."""
 VERSION = metadata.version("track-fusion-centre")
 
 
@@ -77,7 +79,7 @@ class FusionCentre:
         start: dict[str, Any] = {"kind": "start", "epoch": epoch}
         if checkpoint is not None:
             self._restore(checkpoint)
-            start["checkpoint"] = checkpoint
+            start |= {"checkpoint": checkpoint} if len(checkpoint) <= MOST_LOGGED else {"left_out": len(checkpoint)}
         if generation is not None:
             self._linker.next_id = (generation << 32) + 1
             start["generation"] = generation
@@ -102,7 +104,7 @@ class FusionCentre:
         orders = self._intake.admit(time, self._time, journal)
         self._obey(orders)
         self._time = time
-        rows = usable_rows(self._intake, time)
+        rows = usable_rows(self._intake, time, journal)
         names = self._intake.names()
         journal.name_sources(names)
         self._associate(rows, time)
@@ -113,6 +115,10 @@ class FusionCentre:
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         return StepResult(tracks, log, self._status(time))
+
+    def refusals(self) -> dict[str, int]:
+        """Refusals by reason since the start, those included that no step has told yet."""
+        return dict(sorted((self._journal.refused + self._intake.waiting_refusals()).items()))
 
     def checkpoint(self) -> bytes:
         """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""
@@ -132,11 +138,12 @@ class FusionCentre:
     def _restore(self, blob: bytes) -> None:
         state, picture = unpack_state(blob, self._intake, self.config.space)
         self._step, self._time, self._linker.next_id = state["step"], state["time"], state["next_id"]
-        self._linker.agreeing = {(a, b): count for a, b, count in state["agreeing"]}
+        self._linker.agreeing = state["agreeing"]
         self._picture = picture
 
     def _obey(self, orders: list[Order]) -> None:
         doomed = [order.track for order in orders if order.what == "delete" and order.track is not None]
+        doomed = [track for track in doomed if 0 < track < 2**64]
         if doomed:
             gone = np.isin(self._picture.id, np.array(doomed, dtype=np.uint64))
             for track in self._picture.id[gone].tolist():
@@ -277,7 +284,7 @@ class FusionCentre:
             uptime=0.0,
             rates={},
             queue={"pending": self._intake.pending()},
-            refused=dict(sorted(self._journal.refused.items())),
+            refused=self.refusals(),
             dropped=dict(sorted(self._journal.dropped.items())),
             sources={name: self._health(source, time) for name, source in sorted(self._intake.sources.items())},
             tracks={name: kinds.get(code, 0) for code, name in enumerate(words.STATUSES)},
@@ -285,11 +292,10 @@ class FusionCentre:
         )
 
     def _health(self, source: Source, time: int) -> dict[str, Any]:
-        period = self._intake.declared(source).period
         return {
             "epoch": max(source.epoch, 0),
             "alive": source.alive,
-            "stale": source.last < 0 or time - source.last > self.config.stale_periods * period * 1e9,
+            "stale": self._intake.is_stale(source, time),
             "muted": source.muted,
             "last": source.last,
             "offset": source.offset / 1e9,

@@ -25,16 +25,25 @@ from fusion_service.checkpoint import CheckpointError
 from fusion_service.clock import MessageClock, WallClock
 from fusion_service.config import ServiceConfig
 from fusion_service.inbox import Inbox
-from fusion_service.state import State, open_state
-from schemas import LocalIntensity, LocalTracks, MessageError, Status, decode, encode, global_key, local_key, parse_key
+from fusion_service.state import State, StateError, open_state
+from schemas import (
+    LocalIntensity,
+    LocalTracks,
+    MessageError,
+    Status,
+    check_name,
+    decode,
+    encode,
+    global_key,
+    local_key,
+    parse_key,
+)
 
 __all__ = ["run_service"]
 
 log = logging.getLogger(__name__)
 
 MAX_NAMES = 4096
-MAX_FAILURES = 2
-"""Steps in a row that may fail before the checkpoint is given up too."""
 
 
 class Arrival(NamedTuple):
@@ -59,13 +68,16 @@ class Service:
         self._bus = bus
         self._state = state
         self._inbox: Inbox[Arrival | Order] = Inbox(config.bus.queue)
-        self._epoch = time.time_ns()
+        self._epoch = 0
         self._blob = state.load()
-        self._centre = self._make_centre()
+        self._generation = state.take_generation()
+        self._centre = self._make_centre(self._generation)
         self._message_clock = MessageClock(config.centre) if config.centre.clock == "message" else None
         self._wall_clock = WallClock(config.centre)
         self._tokens: dict[str, bool] = {}
+        self._lock = threading.Lock()
         self._seen_tokens: dict[str, bool] = {}
+        self._muted: dict[str, Order] = {}
         self._dropped: Counter[str] = Counter()
         self._said: Counter[str] = Counter()
         self._quiet: dict[str, tuple[float, int]] = {}
@@ -74,12 +86,11 @@ class Service:
         self._result: StepResult | None = None
         self._picture = b""
         self._statuses = 0
-        self._failures = 0
-        self._behind = float("-inf")
+        self._told: dict[str, float] = {}
         self._started = time.monotonic()
 
-    def _make_centre(self) -> FusionCentre:
-        generation = self._state.take_generation()
+    def _make_centre(self, generation: int) -> FusionCentre:
+        self._epoch = time.time_ns()
         try:
             return FusionCentre(self._config.centre, self._blob, generation=generation, epoch=self._epoch)
         except CheckpointError as error:
@@ -98,7 +109,7 @@ class Service:
         bus.watch(local_key("*", "alive", realm), self._on_token)
         for what in ("info", "tracks", "intensity"):
             bus.subscribe(local_key("*", what, realm), self._on_sample, on_miss=self._on_miss)
-        bus.answer(global_key(name, "picture", realm), lambda _: self._picture)
+        bus.answer(global_key(name, "picture", realm), self._on_picture)
         bus.answer(global_key(name, "orders", realm), self._on_order)
         bus.announce(global_key(name, "alive", realm))
         threading.Thread(target=self._wake_at, args=(stop,), daemon=True).start()
@@ -110,11 +121,13 @@ class Service:
             if self._message_clock is None:
                 timeout = min(timeout, self._wall_clock.wait(time.time_ns()))
             for _, item in self._inbox.take(timeout):
+                if stop.is_set():
+                    break
                 self._receive(item)
             changed = self._note_tokens()
             self._note_drops()
             self._step_all(stop)
-            if changed or time.monotonic() >= status_due:
+            if (changed and self._allowed("status", 0.1)) or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
                 self._publish_status()
                 _notify("WATCHDOG=1")
@@ -136,20 +149,35 @@ class Service:
         self._counts["missed"] += count
 
     def _on_token(self, key: str, alive: bool) -> None:
-        name = key.rsplit("/", 2)[-2]
-        if name in self._tokens or len(self._tokens) < MAX_NAMES:
+        try:
+            name = parse_key(key).name
+        except ValueError:
+            return
+        with self._lock:
+            if name not in self._tokens and len(self._tokens) >= MAX_NAMES:
+                dead = next((one for one, there in self._tokens.items() if not there), None)
+                if dead is None:
+                    return
+                del self._tokens[dead]
             self._tokens[name] = alive
-            self._inbox.wake()
+        self._inbox.wake()
+
+    def _on_picture(self, payload: bytes | None) -> bytes:
+        if not self._picture:
+            raise ValueError("no step has been made yet")
+        return self._picture
 
     def _on_order(self, payload: bytes | None) -> bytes:
         raw = msgpack.unpackb(payload or b"\x80")
         if not isinstance(raw, dict) or raw.get("what") not in ("mute", "unmute", "delete"):
             raise ValueError('an order is a map: {"what": "mute" | "unmute" | "delete", "source" or "track": ...}')
         source, track = raw.get("source", ""), raw.get("track")
-        if raw["what"] == "delete" and not isinstance(track, int):
+        if raw["what"] == "delete" and not (type(track) is int and 0 < track < 2**64):
             raise ValueError('the order delete needs the global id: {"what": "delete", "track": id}')
-        if raw["what"] != "delete" and not (isinstance(source, str) and source):
-            raise ValueError('the orders mute and unmute need a name: {"what": "mute", "source": name}')
+        if raw["what"] != "delete":
+            if not isinstance(source, str):
+                raise ValueError('the orders mute and unmute need a name: {"what": "mute", "source": name}')
+            check_name(source)
         self._inbox.put("", Order(raw["what"], source, track))
         return b"\xc3"
 
@@ -158,6 +186,10 @@ class Service:
     def _receive(self, item: Arrival | Order) -> None:
         if isinstance(item, Order):
             log.info("order: %s %s%s", item.what, item.source, item.track or "")
+            if item.what == "mute" and len(self._muted) < MAX_NAMES:
+                self._muted[item.source] = item
+            elif item.what == "unmute":
+                self._muted.pop(item.source, None)
             self._centre.handle(item, time.time_ns())
             return
         self._counts["messages"] += 1
@@ -190,16 +222,28 @@ class Service:
 
     def _note_tokens(self) -> bool:
         """Tell the centre which sources came and went; whether any did."""
-        changed = False
-        for name, alive in list(self._tokens.items()):
-            if self._seen_tokens.get(name) is not alive:
-                self._seen_tokens[name] = alive
+        with self._lock:
+            tokens = dict(self._tokens)
+        changed = {name: alive for name, alive in tokens.items() if self._seen_tokens.get(name) is not alive}
+        for name, alive in changed.items():
+            self._centre.handle(SourceFound(name) if alive else SourceLost(name), time.time_ns())
+            if self._message_clock is not None:
+                self._message_clock.presence(name, alive)
+        self._seen_tokens = tokens
+        if changed and len(changed) <= 5 and self._allowed("tokens", 0.2):
+            for name, alive in changed.items():
                 log.info("source %s is %s", name, "there" if alive else "gone")
-                self._centre.handle(SourceFound(name) if alive else SourceLost(name), time.time_ns())
-                if self._message_clock is not None:
-                    self._message_clock.presence(name, alive)
-                changed = True
-        return changed
+        elif changed and self._allowed("many tokens", 1.0):
+            log.info("sources coming and going: %d changed, %d there", len(changed), sum(tokens.values()))
+        return bool(changed)
+
+    def _allowed(self, what: str, interval: float) -> bool:
+        """Whether `interval` seconds have passed since this was last allowed."""
+        now = time.monotonic()
+        if now - self._told.get(what, float("-inf")) < interval:
+            return False
+        self._told[what] = now
+        return True
 
     def _note_drops(self) -> None:
         for name, total in self._inbox.dropped.items():
@@ -220,49 +264,85 @@ class Service:
     def _warn_behind(self, due: int) -> None:
         """The messages' time is before the checkpoint's: no step can be made there again."""
         self._counts["behind"] += 1
-        if time.monotonic() - self._behind > 10.0:
-            self._behind = time.monotonic()
-            log.warning(
-                "the messages are %.0f s before the last step of the checkpoint: to begin a mission anew, "
-                "stop the service and delete the folder %s",
-                (self._centre.time - due) / 1e9,
-                self._config.service.state,
-            )
+        words = (
+            "the messages are %.0f s before the last step of the checkpoint: to begin a mission anew, "
+            "stop the service and delete the folder %s"
+        )
+        if self._allowed(words, 10.0):
+            log.warning(words, (self._centre.time - due) / 1e9, self._config.service.state)
 
     def _step(self, at: int) -> None:
         begin = time.perf_counter()
         try:
-            result = self._centre.step(at)
-            self._blob = self._centre.checkpoint()
-            self._state.save(self._blob)
-            sent = time.time_ns()
-            picture, journal = (encode(dataclasses.replace(part, sent=sent)) for part in (result.tracks, result.log))
+            result, data = self._make(at)
         except Exception:
-            self._counts["failed_steps"] += 1
-            self._failures += 1
-            if self._failures > MAX_FAILURES:
-                self._blob = None
-            log.exception(
-                "the step at %d failed: going on from %s", at, "the last checkpoint" if self._blob else "nothing"
-            )
-            self._centre = self._make_centre()
-            return
-        self._failures = 0
+            again = self._recover(at)
+            if again is None:
+                return
+            result, data = again
+        self._save()
         self._result = result
         seconds = time.perf_counter() - begin
         self._counts["steps"] += 1
         self._step_seconds["last"] = seconds
         self._step_seconds["max"] = max(self._step_seconds["max"], seconds)
         self._step_seconds["total"] += seconds
-        self._picture = picture
-        self._out["tracks"].put(picture)
-        self._out["log"].put(journal)
-        self._log_refusals(result.status)
+        self._picture = data["tracks"]
+        for what, payload in data.items():
+            self._out[what].put(payload)
+        self._log_refusals(result.status.refused, result.status.dropped)
 
-    def _log_refusals(self, status: Status) -> None:
+    def _make(self, at: int) -> tuple[StepResult, dict[str, bytes]]:
+        """Make a step, and all that it leaves behind, or raise with nothing left behind."""
+        result = self._centre.step(at)
+        blob = self._centre.checkpoint()
+        sent = time.time_ns()
+        tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
+        data = {"tracks": encode(tracks), "log": encode(journal)}
+        self._blob = blob
+        return result, data
+
+    def _recover(self, at: int) -> tuple[StepResult, dict[str, bytes]] | None:
+        """A step failed, by a fault of ours: drop what came in since the last one, and make it from the last
+        checkpoint; if that fails too, begin with nothing."""
+        self._counts["failed_steps"] += 1
+        self._loudly("the step at %d failed: what came in for it is dropped", at)
+        self._restart()
+        try:
+            return self._make(at)
+        except Exception:
+            self._loudly("the step at %d fails without input too: starting without the checkpoint", at)
+            self._blob = None
+            self._restart()
+            return None
+
+    def _restart(self) -> None:
+        try:
+            self._generation = self._state.take_generation()
+        except (OSError, StateError) as error:
+            self._generation += 1
+            self._loudly("cannot write an id generation: %s", error)
+        self._centre = self._make_centre(self._generation)
+        self._seen_tokens = {}
+        for order in self._muted.values():
+            self._centre.handle(order, time.time_ns())
+
+    def _save(self) -> None:
+        try:
+            self._state.save(self._blob or b"")
+        except OSError as error:
+            self._counts["unsaved"] += 1
+            self._loudly("cannot save the checkpoint: %s", error)
+
+    def _loudly(self, words: str, *values: object) -> None:
+        """Log an error, with its trace if there is one, at most once in ten seconds for the same words."""
+        if self._allowed(words, 10.0):
+            log.error(words, *values, exc_info=not isinstance(values[-1], Exception))
+
+    def _log_refusals(self, refused: dict[str, int], dropped: dict[str, int]) -> None:
         """One line per reason and interval, with the number since the last line."""
         now = time.monotonic()
-        for reason, total in {**status.refused, **{f"dropped:{k}": v for k, v in status.dropped.items()}}.items():
+        for reason, total in {**refused, "dropped from a queue": sum(dropped.values())}.items():
             since, told = self._quiet.get(reason, (float("-inf"), 0))
             if total > told and now - since >= 1.0 / max(self._config.service.log_refusals, 1e-3):
                 self._quiet[reason] = (now, total)
@@ -281,6 +361,8 @@ class Service:
         for name, alive in self._seen_tokens.items():
             sources[name] = {**sources.get(name, {}), "alive": alive}
         queue = {"waiting": len(self._inbox), "capacity": self._inbox.capacity, "high_water": self._inbox.high_water}
+        refused = self._centre.refusals()
+        self._log_refusals(refused, last.dropped if last is not None else {})
         status = Status(
             source=self._config.centre.name,
             epoch=self._epoch,
@@ -291,7 +373,7 @@ class Service:
             uptime=uptime,
             rates={name: recent[name] / span for name in ("messages", "bytes", "steps")},
             queue={**queue, **(last.queue if last is not None else {}), "missed": counts["missed"]},
-            refused=last.refused if last is not None else {},
+            refused=refused,
             dropped=last.dropped if last is not None else {},
             sources=sources,
             tracks=last.tracks if last is not None else {},
@@ -300,6 +382,7 @@ class Service:
                 "max": self._step_seconds["max"],
                 "mean": self._step_seconds["total"] / steps,
                 "failed": float(counts["failed_steps"]),
+                "unsaved": float(counts["unsaved"]),
                 "skipped": float(self._wall_clock.skipped),
                 "behind": float(counts["behind"]),
             },

@@ -50,7 +50,8 @@ class Journal:
 
     def event(self, event: dict[str, Any]) -> None:
         """Something other than a message that changes results or explains them."""
-        self._events.append(event)
+        if len(self._events) < MOST_ENTRIES:
+            self._events.append(event)
 
     def take(self, entry: Entry) -> None:
         """A message used in this step."""

@@ -13,12 +13,15 @@ from fusion_service.config import CentreConfig
 from fusion_service.journal import Journal
 from fusion_service.lifecycle import Picture, newborn
 from fusion_service.rows import NO_TRACK, Rows
+from schemas import Entry
 from schemas import messages as words
 
 __all__ = ["Linker"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+MOST_BYTES = 12_000_000
+"""Global tracks are not started beyond what one message can carry with room to spare."""
 Agreement = tuple[int, int, float]
 """Two global ids and their d2."""
 
@@ -35,6 +38,8 @@ class Linker:
         self.next_id = 1
         gates = chi2.ppf([config.gate, config.keep_gate], len(config.space))
         self._gate, self._keep_gate = float(gates[0]), float(gates[1])
+        n = len(config.space)
+        self._most = MOST_BYTES // (8 * (n + n * (n + 1) // 2) + 200)
         self._places = [config.space.index(axis) for axis in ("x", "y", "z") if axis in config.space]
 
     def check(self, rows: Rows, journal: Journal) -> None:
@@ -131,6 +136,10 @@ class Linker:
         tracks, count = rows.tracks, len(known)
         roots = root[count:]
         starting = np.unique(roots[(roots >= count) & rows.may_start[free]])
+        room = max(0, self._most - len(picture.id))
+        if len(starting) > room:
+            journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(starting) - room))
+            starting = starting[:room]
         new_ids = np.arange(self.next_id, self.next_id + len(starting), dtype=np.uint64)
         self.next_id += len(starting)
         ids = np.zeros(len(root), dtype=np.uint64)

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.intake import Intake
+from fusion_service.journal import Journal
 from fusion_service.motion import predict
 from fusion_service.sources import Tracks
+from schemas import Entry
 
 __all__ = ["NO_TRACK", "Rows", "usable_rows", "write_back"]
 
@@ -25,29 +27,29 @@ class Rows:
 
     source (M,): index into the sorted names. epoch (M,) u64. tracks: their columns, mean (n, M) and covariance
     (n, n, M) predicted and marginalised to the centre's space; the columns of links may be written. may_start
-    (M,). kept: for each source which rows of its own table these are.
+    (M,). kept: how many of them each source has, in order.
     """
 
     source: NDArray[np.intp]
     epoch: NDArray[np.uint64]
     tracks: Tracks
     may_start: NDArray[np.bool_]
-    kept: dict[str, NDArray[np.intp]]
+    kept: dict[str, int]
 
     def linked(self) -> NDArray[np.intp]:
         """Rows that belong to a global track."""
         return np.flatnonzero(self.tracks.link != NO_TRACK)
 
 
-def usable_rows(intake: Intake, time: int) -> Rows:
-    """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table; what
-    has no sound density there is left out."""
+def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
+    """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table, and
+    so does what has no sound density there (refused: ill-conditioned)."""
     config = intake.config
     parts: list[Tracks] = []
     index: list[NDArray[np.intp]] = []
     epochs: list[NDArray[np.uint64]] = []
     starts: list[NDArray[np.bool_]] = []
-    kept: dict[str, NDArray[np.intp]] = {}
+    kept: dict[str, int] = {}
     for number, (name, source) in enumerate(sorted(intake.sources.items())):
         said = intake.declared(source)
         oldest = time - round(config.stale_periods * said.period * 1e9)
@@ -58,12 +60,16 @@ def usable_rows(intake: Intake, time: int) -> Rows:
         mean, covariance = predict(said.motion, source.space, table.mean, table.covariance, dt)
         at = [source.space.index(component) for component in config.space]
         mean, covariance = mean[at], covariance[np.ix_(at, at)]
-        sound = np.flatnonzero(linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0))
-        kept[name] = sound
+        sound = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
+        count = int(sound.sum())
+        if count < len(sound):
+            journal.refuse(Entry(name, source.epoch, 0, 0, "ill-conditioned", len(sound) - count))
+            source.tracks = table.take(sound)
+        kept[name] = count
         parts.append(replace(table, mean=mean, covariance=covariance).take(sound))
-        index.append(np.full(len(sound), number, dtype=np.intp))
-        epochs.append(np.full(len(sound), source.epoch, dtype=np.uint64))
-        starts.append(np.full(len(sound), said.may_start, dtype=np.bool_))
+        index.append(np.full(count, number, dtype=np.intp))
+        epochs.append(np.full(count, source.epoch, dtype=np.uint64))
+        starts.append(np.full(count, said.may_start, dtype=np.bool_))
     if not parts:
         nothing = intake.nothing()
         return Rows(np.zeros(0, dtype=np.intp), nothing.id, nothing, np.zeros(0, dtype=np.bool_), kept)
@@ -74,11 +80,7 @@ def usable_rows(intake: Intake, time: int) -> Rows:
 def write_back(rows: Rows, intake: Intake) -> None:
     """Put the columns of links back into the sources' own tables."""
     start = 0
-    for name, kept in rows.kept.items():
-        source, end = intake.sources[name], start + len(kept)
-        columns = {}
-        for column in LINK_COLUMNS:
-            columns[column] = getattr(source.tracks, column).copy()
-            columns[column][kept] = getattr(rows.tracks, column)[start:end]
-        source.tracks = replace(source.tracks, **columns)
-        start = end
+    for name, count in rows.kept.items():
+        source, part = intake.sources[name], slice(start, start + count)
+        source.tracks = replace(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINK_COLUMNS})
+        start += count

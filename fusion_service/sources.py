@@ -8,6 +8,7 @@ within one epoch, so a restarted client takes over nobody's links.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from schemas import Frame, Height, LocalTracks, SensorInfo
 __all__ = ["REMEMBERED", "Source", "Tracks", "empty_tracks", "message_tracks", "newest"]
 
 REMEMBERED = 1024
+MOST_GAPS = 2**62
 """Messages of one source whose exact repeat is recognised; older ones are too late to matter."""
 
 
@@ -59,35 +61,47 @@ def empty_tracks(n: int) -> Tracks:
     return Tracks(ids, whole, np.zeros((n, 0)), np.zeros((n, n, 0)), real, whole, ids, whole, whole, whole)
 
 
-def message_tracks(message: LocalTracks, sound: NDArray[np.bool_], frame: Frame, height: Height | None) -> Tracks:
-    """The sound tracks of a message in `frame`, mixtures as their mean and covariance, sorted by id.
+def message_tracks(
+    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], frame: Frame, height: Height | None
+) -> Tracks:
+    """The sound tracks of messages of one space, frame and height, in `frame`, one after the other; mixtures as
+    their mean and covariance.
 
-    Raises `geodesy.FrameError` where the message's frame cannot be brought into `frame`.
+    Raises `geodesy.FrameError` where their frame cannot be brought into `frame`.
     """
-    means, covariances = moments(message.means, message.covariances, message.weights, message.counts)
-    rows = np.flatnonzero(sound)
-    rows = rows[np.argsort(message.ids[rows], kind="stable")]
-    means, covariances = geodesy.transform(
-        means[rows], covariances[rows], message.space, message.frame, frame, message.height or height
-    )
-    times = np.full(len(rows), message.time, dtype=np.int64)
-    none = np.full(len(rows), -1, dtype=np.int64)
+    first = messages[0]
+    parts = [moments(m.means, m.covariances, m.weights, m.counts) for m in messages]
+    means = np.concatenate([mean[rows] for (mean, _), rows in zip(parts, sound, strict=True)])
+    covariances = np.concatenate([spread[rows] for (_, spread), rows in zip(parts, sound, strict=True)])
+    means, covariances = geodesy.transform(means, covariances, first.space, first.frame, frame, first.height or height)
+    counts = [int(rows.sum()) for rows in sound]
+    times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
+    updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
+    existence = [np.full(len(m.ids), np.nan) if m.existence is None else m.existence for m in messages]
+    none = np.full(len(times), -1, dtype=np.int64)
     return Tracks(
-        id=message.ids[rows].astype(np.uint64),
+        id=_gather([m.ids for m in messages], sound).astype(np.uint64),
         time=times,
         mean=linalg.to_last(means, 1),
         covariance=linalg.symmetrise(linalg.to_last(covariances, 2)),
-        existence=np.full(len(rows), np.nan) if message.existence is None else message.existence[rows].astype(float),
-        updated=times if message.updated is None else np.minimum(message.updated[rows], times),
-        link=np.zeros(len(rows), dtype=np.uint64),
+        existence=_gather(existence, sound).astype(np.float64),
+        updated=np.minimum(_gather(updated, sound), times),
+        link=np.zeros(len(times), dtype=np.uint64),
         since=none,
-        fails=np.zeros(len(rows), dtype=np.int64),
+        fails=np.zeros(len(times), dtype=np.int64),
         used=none,
     )
 
 
+def _gather(columns: Sequence[NDArray[Any]], rows: Sequence[NDArray[np.bool_]]) -> NDArray[Any]:
+    return np.concatenate([column[mask] for column, mask in zip(columns, rows, strict=True)])
+
+
 def newest(old: Tracks, new: Tracks) -> Tracks:
-    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept."""
+    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept.
+
+    `old` is sorted by id; `new` may hold an id several times.
+    """
     if len(old.id) and len(new.id):
         at = np.minimum(np.searchsorted(old.id, new.id), len(old.id) - 1)
         known = old.id[at] == new.id
@@ -120,6 +134,7 @@ class Source:
     gaps: int = 0
     reordered: int = 0
     highest: dict[str, int] = field(default_factory=dict)
+    first: dict[str, int] = field(default_factory=dict)
     seen: deque[tuple[str, int, int]] = field(default_factory=deque)
     seen_set: set[tuple[str, int, int]] = field(default_factory=set)
 
@@ -127,7 +142,7 @@ class Source:
         """Forget the last run: tracks, links, sequence."""
         self.epoch, self.info, self.waited, self.last, self.complete = epoch, None, 0, -1, -1
         self.tracks = empty_tracks(len(self.space))
-        self.highest, self.seen, self.seen_set = {}, deque(), set()
+        self.highest, self.first, self.seen, self.seen_set = {}, {}, deque(), set()
 
     def is_repeat(self, kind: str, seq: int, digest: int) -> bool:
         """Whether this very message was taken before."""
@@ -136,30 +151,36 @@ class Source:
     def note(self, kind: str, seq: int, digest: int) -> None:
         """Count a message into the sequence: a gap is what is missing so far, a late filler mends it."""
         self.messages += 1
-        highest = self.highest.get(kind)
-        if highest is None or seq > highest:
-            if highest is not None:
-                self.gaps += seq - highest - 1
+        if kind not in self.highest:
+            self.highest[kind] = self.first[kind] = seq
+        elif seq > self.highest[kind]:
+            self.gaps = min(self.gaps + seq - self.highest[kind] - 1, MOST_GAPS)
             self.highest[kind] = seq
-        elif seq < highest:
+        elif seq < self.highest[kind]:
             self.reordered += 1
-            self.gaps = max(0, self.gaps - 1)
+            if seq > self.first[kind]:
+                self.gaps = max(0, self.gaps - 1)
         key = (kind, seq, digest)
         self.seen.append(key)
         self.seen_set.add(key)
         if len(self.seen) > REMEMBERED:
             self.seen_set.discard(self.seen.popleft())
 
-    def apply(self, message: LocalTracks, new: Tracks) -> None:
-        """Take the tracks of a message; those of a complete scan that it does not list are gone."""
-        self.last = max(self.last, message.time)
-        if message.time < self.complete:
-            return
-        if new.mean.shape[0] != self.tracks.mean.shape[0] or message.space != self.space:
-            self.space, self.tracks = message.space, empty_tracks(len(message.space))
-        merged = newest(self.tracks, new)
-        if message.complete:
-            self.complete = message.time
-            listed = np.isin(merged.id, message.ids)
-            merged = merged.take(listed | (merged.time > message.time))
-        self.tracks = merged
+    def apply(self, messages: Sequence[LocalTracks], new: Tracks, most: int) -> bool:
+        """Take the tracks of a complete scan, or of partial ones in a row; what a complete scan does not list is
+        gone. False, and nothing is changed, if there would be more than `most` tracks."""
+        space, complete = messages[-1].space, messages[-1].complete
+        new = new.take(new.time >= self.complete)
+        old = self.tracks if space == self.space else empty_tracks(len(space))
+        merged = newest(old, new)
+        end = messages[-1].time
+        if complete and end >= self.complete:
+            listed = np.isin(merged.id, messages[-1].ids)
+            merged = merged.take(listed | (merged.time > end))
+        if len(merged.id) > most:
+            return False
+        if complete:
+            self.complete = max(self.complete, end)
+        self.last = max(self.last, *(message.time for message in messages))
+        self.space, self.tracks = space, merged
+        return True

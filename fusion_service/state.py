@@ -38,7 +38,8 @@ class State:
         self._last = 0
 
     def take_generation(self) -> int:
-        """A generation that was never taken before, on disk when this returns."""
+        """A generation that was never taken before, on disk when this returns. `StateError` or `OSError` if it
+        cannot be; the next one after the last of this process is then safe only as long as it lives."""
         last = self._last
         if self._folder is not None:
             path = self._folder / "generation"
@@ -48,6 +49,8 @@ class State:
                 raise StateError(f"{path} does not hold a number: delete it to go on with the clock's") from None
         self._last = max(last + 1, _by_clock())
         if self._folder is not None:
+            if not self._last < 2**32:
+                raise StateError(f"{self._folder / 'generation'} is used up: delete it to go on with the clock's")
             self._write("generation", f"{self._last}\n".encode(), sync=True)
         return self._last
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from worlds import FRAME, SECOND, SIGMA, SPACE, START, centre, give, info, moved, seen, step, tracks, truth
 
 import schemas
-from fusion_service.centre import FusionCentre, Order, SourceFound, SourceLost, StepResult
+from fusion_service.centre import FusionCentre, Order, Refused, SourceFound, SourceLost, StepResult
 from fusion_service.checkpoint import CheckpointError
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
@@ -475,6 +475,106 @@ def test_no_message_makes_it_raise_or_publish_nonsense(batch: list[Any]) -> None
         assert (schemas.check_numbers([result.tracks])[0] == 0).all()
         schemas.encode(result.log)
         schemas.encode(result.status)
+
+
+def test_other_events_in_any_order_leave_the_same_bytes() -> None:
+    events = [
+        Refused("b", "not-msgpack"), Refused("a", "version"), Refused("a", "version"),
+        Refused("c", "queue", 3, dropped=True), SourceFound("r2"), SourceFound("r1"), tracks("r1", 1, truth(2)), info("r1"),
+    ]  # fmt: skip
+
+    def run(order: Iterable[int]) -> list[bytes]:
+        made = FusionCentre({})
+        give(made, *(events[k] for k in order))
+        result = step(made, 1)
+        return [schemas.encode(part) for part in (result.tracks, result.log, result.status)]
+
+    assert run(range(8)) == run(reversed(range(8)))
+
+
+def test_the_time_of_reception_does_not_matter_between_repeats() -> None:
+    blobs = []
+    for received in ((5, 6), (6, 5)):
+        made = centre(("r1",))
+        for at in received:
+            made.handle(tracks("r1", 1, truth(2)), START + at * SECOND)
+        step(made, 1)
+        blobs.append(made.checkpoint())
+    assert blobs[0] == blobs[1]
+
+
+def test_an_older_epoch_is_believed_once_the_newer_run_is_silent() -> None:
+    made = centre(("r1",))
+    give(made, info("r1", epoch=50), tracks("r1", 1, truth(2), epoch=50))
+    step(made, 1)
+    give(made, tracks("r1", 2, truth(2), epoch=40))
+    assert step(made, 2).status.refused == {"old-epoch": 1}
+    give(made, info("r1", epoch=40), tracks("r1", 8, truth(2), epoch=40, seq=1))
+    assert step(made, 8).tracks.contributor_epoch.tolist() == [40, 40]
+
+
+def test_the_frame_is_that_of_the_first_sound_track() -> None:
+    made = FusionCentre({})
+    give(made, info("a"), tracks("a", 1, np.zeros((0, 4)), frame=schemas.Local("x")))
+    give(made, info("b"), tracks("b", 1, truth(2)))
+    assert step(made, 1).tracks.frame == FRAME
+
+
+def test_partial_scans_of_many_tracks_are_taken_together_and_as_one_by_one() -> None:
+    states = truth(30)
+    pictures = []
+    for together in (True, False):
+        made = centre(("r1",))
+        for k in range(30):
+            give(made, tracks("r1", 1 + k / 100, states[k : k + 1], [k + 1], seq=k, complete=False))
+            give(made, tracks("r1", 1.5 + k / 100, states[k : k + 1] + 1.0, [k + 1], seq=100 + k, complete=False))
+            if not together:
+                step(made, 1.5 + k / 100)
+        pictures.append(step(made, 2).tracks)
+    together, apart = pictures
+    assert len(together.ids) == len(apart.ids) == 30
+    np.testing.assert_array_equal(np.sort(together.means, axis=0), np.sort(apart.means, axis=0))
+
+
+def test_a_table_full_of_tracks_takes_its_own_updates_and_refuses_more() -> None:
+    from fusion_service.intake import MAX_TRACKS
+
+    rng = np.random.default_rng(1)
+    count = MAX_TRACKS
+    means = np.concatenate([rng.uniform(-1e7, 1e7, (count, 2)), np.zeros((count, 2))], axis=1)
+    made = centre(("r1",))
+    give(made, tracks("r1", 1, means))
+    assert len(step(made, 1).tracks.ids) == count
+    give(made, tracks("r1", 2, means[:1], [count + 1], complete=False), tracks("r1", 3, means, seq=3))
+    after = step(made, 3)
+    assert after.status.refused == {"too-many-tracks": 1}
+    assert after.tracks.contributor_counts.sum() == count
+
+
+def test_a_filler_of_before_the_first_message_mends_no_gap() -> None:
+    made = centre(("r1",))
+    give(made, *(tracks("r1", 1 + k / 100, truth(1), seq=seq) for k, seq in enumerate((10, 13))))
+    step(made, 2)
+    give(made, tracks("r1", 1.5, truth(1), seq=5), tracks("r1", 1.6, truth(1), seq=11))
+    assert step(made, 3).status.sources["r1"]["gaps"] == 1
+
+
+def test_a_track_whose_density_overflows_on_its_way_is_told() -> None:
+    made = FusionCentre({"source_defaults": {"period": 1e5}})
+    wild = np.array([1.0, 1.0, 1e11, 1e11])
+    give(made, info("r1", period=1e5), tracks("r1", 1, [[0, 0, 0, 0]], sigma=wild))
+    result = step(made, 2e5)
+    assert len(result.tracks.ids) == 0
+    assert result.status.refused.get("ill-conditioned", 0) == 1
+
+
+def test_arrays_that_do_not_belong_together_are_refused() -> None:
+    message = tracks("r1", 1, truth(3))
+    made = centre(("r1", "r2"))
+    give(made, dataclasses.replace(message, means=message.means[:2]), tracks("r2", 1, truth(3)))
+    result = step(made, 1)
+    assert result.status.refused == {"length": 1}
+    assert len(result.tracks.ids) == 3
 
 
 # Checkpoint and ids
