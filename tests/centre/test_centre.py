@@ -480,7 +480,8 @@ def test_no_message_makes_it_raise_or_publish_nonsense(batch: list[Any]) -> None
 def test_other_events_in_any_order_leave_the_same_bytes() -> None:
     events = [
         Refused("b", "not-msgpack"), Refused("a", "version"), Refused("a", "version"),
-        Refused("c", "queue", 3, dropped=True), SourceFound("r2"), SourceFound("r1"), tracks("r1", 1, truth(2)), info("r1"),
+        Refused("c", "queue", 3, dropped=True), SourceFound("r2"), SourceFound("r1"),
+        tracks("r1", 1, truth(2)), info("r1"),
     ]  # fmt: skip
 
     def run(order: Iterable[int]) -> list[bytes]:
