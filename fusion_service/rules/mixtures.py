@@ -174,7 +174,7 @@ def fuse_mixtures_last(
 
     def block(at: slice) -> tuple[Mixtures, FloatArray]:
         some = [Mixtures(f.log_weights[:, at], f.means[..., at], f.covariances[..., at]) for f in sources]
-        out, w = _fused(rule, some, None if weights is None else weights[:, at], chosen)
+        out, w = _fused(rule, some, None if weights is None else weights[:, at], chosen, prune)
         if normalise:
             out = out.normalised()
         return reduce_mixtures(out, max_components=max_components, prune=prune, method=reduction), w
@@ -189,7 +189,7 @@ def fuse_mixtures_last(
 
 
 def _fused(
-    rule: str, sources: Sequence[Mixtures], weights: FloatArray | None, chosen: dict[str, Any]
+    rule: str, sources: Sequence[Mixtures], weights: FloatArray | None, chosen: dict[str, Any], prune: float
 ) -> tuple[Mixtures, FloatArray]:
     if rule not in MIXTURE_RULES:
         fused = fuse_last(rule, *_moments(sources), weights, **chosen)
@@ -204,7 +204,7 @@ def _fused(
         )
         return union, w
     if rule == "cu-modes":
-        return _modes(sources, weights, **chosen)
+        return _modes(sources, weights, prune, **chosen)
     sources = [Mixtures(f.log_weights, f.means, f.covariances * chosen["alpha"]) for f in sources]
     w = _weights(rule, sources, chosen) if weights is None else weights
     return _means(rule, sources, w, chosen), w
@@ -308,13 +308,15 @@ class _Ratio:
 
 
 def _modes(
-    sources: Sequence[Mixtures], weights: FloatArray | None, criterion: str, gate: float
+    sources: Sequence[Mixtures], weights: FloatArray | None, prune: float, criterion: str, gate: float
 ) -> tuple[Mixtures, FloatArray]:
-    """cu-modes."""
+    """cu-modes. What will be pruned, which the weights tell, is not computed."""
     N, n, B = len(sources), len(sources[0].means), len(sources[0])
     w = np.full((N, B), 1.0 / N) if weights is None else weights
     choice = np.indices([len(f.log_weights) for f in sources]).reshape(N, -1)
     logs = total(np.stack([f.log_weights[c] for f, c in zip(sources, choice, strict=True)]))
+    light = (logs < log_sum(logs) + np.log(prune)) & (logs < logs.max(axis=0))
+    logs = np.where(light, -np.inf, logs)
     part, b = np.nonzero(~np.isneginf(logs))
     x = np.stack([f.means[:, c[part], b] for f, c in zip(sources, choice, strict=True)])
     P = np.stack([f.covariances[:, :, c[part], b] for f, c in zip(sources, choice, strict=True)])

@@ -128,6 +128,33 @@ def test_many_seeds_are_unbiased() -> None:
     assert np.mean([r.mass for r in runs]) == pytest.approx(exact.sum() * CELL, rel=0.005)
 
 
+def test_three_sources_at_once() -> None:
+    """The example of Dubey's formulas: exact mean and variance 1.7093 and .3545."""
+    numbers = ((0.0, 1.0), (1.0, 2.0), (2.5, 0.5))
+    sources = [Mixture([1.0], [[m]], [[[v]]]) for m, v in numbers]
+    fused = fuse_mixtures("hmd-s", sources, weights=[0.2, 0.3, 0.5], samples=100_000)
+    assert fused.means[0, 0] == pytest.approx(1.7093, abs=0.005)
+    assert fused.covariances[0, 0, 0] == pytest.approx(0.3545, rel=0.01)
+    halves = [Mixture([0.4, 0.6], [[m], [m]], [[[v]], [[v]]]) for m, v in numbers]
+    again = fuse_mixtures("hmd-s", halves, weights=[0.2, 0.3, 0.5], samples=100_000, max_components=1)
+    assert again.means[0, 0] == pytest.approx(fused.means[0, 0], abs=1e-9)
+    assert again.covariances[0, 0, 0] == pytest.approx(fused.covariances[0, 0, 0], abs=1e-9)
+
+
+@given(seeds, dimensions, st.integers(2, 3))
+@settings(max_examples=25, deadline=None)
+def test_the_means_are_ordered(seed: int, n: int, N: int) -> None:
+    """Harmonic below geometric below first order, in mass too: what bounds the weights of the samples."""
+    rng = np.random.default_rng(seed)
+    sources = [random_mixture(rng, C, n) for C in rng.integers(1, 4, N)]
+    w = rng.dirichlet(np.ones(N))
+    first = fuse_mixtures("gm-ga", sources, weights=w, normalise=False).mass
+    for rule in ("hmd-s", "gmd-s"):
+        fused = fused_unless_too_far(rule, sources, {"weights": w, "samples": 400, "normalise": False})
+        if fused is not None:
+            assert fused.mass <= first * (1 + 1e-9)
+
+
 def test_li_2nd_figure_7() -> None:
     published = fuse_mixtures("gm-ga", [GM1, GM2], weights="uniform", normalise=False)
     assert published.mass == pytest.approx(1.8964, abs=5e-5)
