@@ -43,7 +43,7 @@ def _scan(cost: Cost, w: FloatArray) -> FloatArray:
     best, low = w[0], np.full_like(w[0], np.inf)
     for t in sorted(np.linspace(0.0, 1.0, POINTS), key=lambda t: abs(t - 0.5)):
         here = value(np.full_like(best, t))
-        better = here < low - 1e-12 * np.maximum(1.0, np.abs(low))
+        better = here < low - 1e-12 * np.maximum(1.0, np.abs(here))
         best, low = np.where(better, t, best), np.where(better, here, low)
     lo, hi = np.maximum(best - 1.0 / (POINTS - 1), 0.0), np.minimum(best + 1.0 / (POINTS - 1), 1.0)
     left, right = hi - GOLDEN * (hi - lo), lo + GOLDEN * (hi - lo)
