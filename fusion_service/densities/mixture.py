@@ -30,6 +30,8 @@ __all__ = [
     "power_product",
 ]
 
+CONDITION = 1e8
+"""Largest variance inflation factor that is inverted in float64."""
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
@@ -259,13 +261,17 @@ def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
     powers (N, B), not negative. Components: one for each choice of a component from every source, the last
     source's running fastest. Exact where a power is 1 or a mixture has one component. Between 0 and 1 the first
     order drops the cross terms and is too large, everywhere: (a + b)^w <= a^w + b^w. A power of 0 is the factor 1.
+    Log weights are NaN where a matrix is so ill-conditioned (max_k P_kk P^-1_kk above `CONDITION`) that the result
+    could be wrong by more than about 1e-6.
     """
     N, n, B = len(sources), len(sources[0].means), len(sources[0])
     sizes = [len(f.log_weights) for f in sources]
     factors = []
+    bad = np.zeros(B, dtype=np.bool_)
     with np.errstate(all="ignore"):
         for i, (f, w) in enumerate(zip(sources, powers, strict=True)):
             A, det, _ = linalg.sweep(f.covariances)
+            bad = bad | ((_condition(f.covariances, A) & (f.log_weights > -np.inf)).any(axis=0) & (w > 0.0))
             log_weights = w * (f.log_weights - 0.5 * (np.log(det) + n * LOG_2PI))
             only = np.where(np.arange(len(A[0, 0]))[:, None] == 0, 0.0, -np.inf)
             log_weights = np.where(w > 0.0, np.where(f.log_weights > -np.inf, log_weights, -np.inf), only)
@@ -281,9 +287,19 @@ def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
             if i:
                 y += linalg.matvec(np.broadcast_to(A, information.shape), x - first)
         P, det, _ = linalg.sweep(information)
+        bad |= (_condition(information, P) & (log_weights > -np.inf)).reshape(-1, B).any(axis=0)
         offset = linalg.matvec(P, y)
         log_weights += 0.5 * (n * LOG_2PI - np.log(det))
         for _, x, A in factors:
             d = first + offset - x
             log_weights -= 0.5 * total(d * linalg.matvec(np.broadcast_to(A, information.shape), d))
+    log_weights = np.where(bad, np.nan, log_weights)
     return Mixtures(log_weights.reshape(-1, B), (first + offset).reshape(n, -1, B), P.reshape(n, n, -1, B))
+
+
+def _condition(P: FloatArray, A: FloatArray) -> NDArray[np.bool_]:
+    """Where (...) P with inverse A is beyond `CONDITION`, or no covariance."""
+    worst = P[0, 0] * A[0, 0]
+    for k in range(1, len(P)):
+        worst = np.maximum(worst, P[k, k] * A[k, k])
+    return np.asarray(~((worst <= CONDITION) & (worst >= 0.5)))

@@ -353,6 +353,36 @@ def test_far_apart_sources_are_refused_or_fused() -> None:
         fuse_mixtures("hmd-s", far, weights="uniform", samples=400)
 
 
+@pytest.mark.parametrize(("rule", "options"), [("gm-ga", {}), ("gmd-s", {"samples": 400}), ("hmd-s", {"samples": 400})])
+def test_ill_conditioned_sources_are_refused_never_wrong(rule: str, options: dict[str, Any]) -> None:
+    def sources(close: float) -> list[Mixture]:
+        long = np.array([[1.0, 1.0 - close], [1.0 - close, 1.0]])
+        return [Mixture([0.5, 0.5], [[x, x], [x + 0.1, x]], [long, 2 * long]) for x in (0.0, 1e6)]
+
+    with pytest.raises(RuleError, match="ill-conditioned"):
+        fuse_mixtures(rule, sources(1e-12), **options)
+    x, P = (
+        np.array([[1.0, 0.0], [0.0, 0.5]]),
+        np.array([[[1.0, 1.0 - 1e-7], [1.0 - 1e-7, 1.0]], [[2.0, 0.3], [0.3, 1.0]]]),
+    )
+    if rule == "gm-ga":
+        expected = fuse("ci", x, P, weights="uniform")
+        ours = fuse_mixtures(rule, [Mixture([1.0], [m], [S]) for m, S in zip(x, P, strict=True)], weights="uniform")
+        np.testing.assert_allclose(ours.means[0], expected.mean, rtol=1e-7)
+        np.testing.assert_allclose(ours.covariances[0], expected.covariance, rtol=1e-7)
+
+
+@pytest.mark.parametrize(("rule", "options"), EXACT + SAMPLED)
+def test_far_from_the_origin(rule: str, options: dict[str, Any]) -> None:
+    rng = np.random.default_rng(15)
+    sources = [random_mixture(rng, 2, 3) for _ in range(2)]
+    far = [Mixture(m.weights, m.means + 1e7, m.covariances) for m in sources]
+    here, there = fuse_mixtures(rule, sources, **options), fuse_mixtures(rule, far, **options)
+    np.testing.assert_allclose(there.weights, here.weights, rtol=1e-6)
+    np.testing.assert_allclose(there.means - 1e7, here.means, atol=1e-6)
+    np.testing.assert_allclose(there.covariances, here.covariances, rtol=1e-6, atol=1e-7)
+
+
 def test_criteria() -> None:
     batch = [Mixtures.of([m]) for m in PAIR]
     by = {c: fuse_mixtures_last("gmd-s", batch, criterion=c)[1][0, 0] for c in ("chernoff", "chernoff-mixture", "det")}
