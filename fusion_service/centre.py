@@ -26,6 +26,7 @@ from fusion_service.journal import Journal
 from fusion_service.lifecycle import advance, empty_picture
 from fusion_service.linking import Linker
 from fusion_service.motion import predict
+from fusion_service.presence import existence_now
 from fusion_service.rows import NO_TRACK, Rows, usable_rows, write_back
 from fusion_service.rules import Fused, fuse_last
 from fusion_service.sources import Source
@@ -223,11 +224,7 @@ class FusionCentre:
         newest = np.full(len(picture.id), -1, dtype=np.int64)
         np.maximum.at(newest, at, tracks.time[linked])
         fresh = newest > picture.seen
-        said = np.isfinite(tracks.existence[linked])
-        total = np.zeros(len(picture.id))
-        np.add.at(total, at[said], tracks.existence[linked][said])
-        votes = np.bincount(at[said], minlength=len(picture.id))
-        existence = np.where(votes > 0, total / np.maximum(votes, 1), picture.existence)
+        existence = existence_now(rows, picture, fresh, self._intake, time)
         before = picture.status
         seen = np.maximum(picture.seen, newest)
         picture = replace(picture, updated=updated, existence=existence, seen=seen)

@@ -184,6 +184,10 @@ class CentreConfig:
     confirm_within: int = _setting(4, _whole(1, 64), "... within so many steps")
     confirm_sources: int = _setting(2, _whole(1, 64), "so many sources in one step confirm a track at once")
     confirm_existence: float = _setting(0.0, _number(0, 1), "existence needed to be confirmed")
+    existence: str = _setting("consistent", _choice("consistent", "average", "geometric"), "how existence is fused")
+    min_existence: float = _setting(
+        0.0, _number(0, 1), "a track of less existence is tentative, or ends without support"
+    )
     coast: float = _setting(5.0, _DURATION, "seconds a confirmed track lives on without support")
     stale_periods: float = _setting(3.0, _number(1, 1e6), "a source (or track) is stale after so many periods")
     max_pending: int = _setting(10_000, _whole(1, 10_000_000), "messages held per source for later steps")

@@ -2,7 +2,8 @@
 
 A track is confirmed by new data in M of its last N chances, or at once by several sources in one step; a
 confirmed track without support coasts on its own motion and is deleted when that lasts too long; a tentative
-one is deleted sooner. A chance is a step with new data in it, or without any support.
+one is deleted sooner. One whose existence falls below `min_existence` is tentative again, and deleted if it
+has no support. A chance is a step with new data in it, or without any support.
 """
 
 from __future__ import annotations
@@ -24,8 +25,8 @@ class Picture:
     """G global tracks sorted by id: mean (n, G), covariance (n, n, G), the rest (G,).
 
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
-    seen i64 time of the newest local track in it; supported i64 of the last step with a linked track;
-    hits u64, the last chances as bits; existence.
+    seen i64 time of the newest local track in it; born i64 of its first step; supported i64 of the last step
+    with a linked track; hits u64, the last chances as bits; existence.
     """
 
     id: NDArray[np.uint64]
@@ -35,6 +36,7 @@ class Picture:
     time: NDArray[np.int64]
     updated: NDArray[np.int64]
     seen: NDArray[np.int64]
+    born: NDArray[np.int64]
     supported: NDArray[np.int64]
     hits: NDArray[np.uint64]
     existence: NDArray[np.float64]
@@ -71,6 +73,7 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
         time=never,
         updated=never,
         seen=never,
+        born=np.full(count, time, dtype=np.int64),
         supported=np.full(count, time, dtype=np.int64),
         hits=np.zeros(count, dtype=np.uint64),
         existence=np.ones(count),
@@ -90,10 +93,12 @@ def advance(
     shifted = ((picture.hits << np.uint64(1)) | fresh.astype(np.uint64)) & window
     hits = np.where(chance, shifted, picture.hits)
     proven = (np.bitwise_count(hits) >= config.confirm_hits) | (support >= config.confirm_sources)
-    confirm = supported & proven & (picture.existence >= config.confirm_existence)
+    weak = picture.existence < config.min_existence
+    confirm = supported & ~weak & proven & (picture.existence >= config.confirm_existence)
     status = np.where((picture.status == TENTATIVE) & ~confirm, TENTATIVE, np.where(supported, CONFIRMED, COASTING))
+    status = np.where(weak, TENTATIVE, status)
     last = np.where(supported, time, picture.supported)
     overdue = time - last > round(config.coast * 1e9)
     hopeless = (status == TENTATIVE) & ~supported & (hits == 0)
-    ended = ~supported & (overdue | hopeless)
+    ended = ~supported & (overdue | hopeless | weak)
     return replace(picture, status=status.astype(np.uint8), hits=hits, supported=last), ended

@@ -130,6 +130,7 @@ class Source:
     complete: int = -1
     offset: int = 0
     messages: int = 0
+    scans: int = 0
     repeats: int = 0
     gaps: int = 0
     reordered: int = 0
@@ -180,6 +181,7 @@ class Source:
         if len(merged.id) > most:
             return False
         if complete:
+            self.scans += end >= self.complete
             self.complete = max(self.complete, end)
         self.last = max(self.last, *(message.time for message in messages))
         self.space, self.tracks = space, merged
