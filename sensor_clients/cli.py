@@ -30,6 +30,7 @@ EXAMPLES = """examples:
   sensor-client simulate three-radars --sensor radar2 --tracker imm
   sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
+  sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
 """
 
 

@@ -1,6 +1,7 @@
 """Local trackers, batched over tracks (the batch axis is the last)."""
 
 from sensor_clients.filters.association import Association, associate, likelihood, update
+from sensor_clients.filters.bearing import Bearing, BearingTracker
 from sensor_clients.filters.gmphd import GmPhdFilter, PhdConfig
 from sensor_clients.filters.imm import ImmTracker, Modes
 from sensor_clients.filters.measurement import (
@@ -16,6 +17,8 @@ from sensor_clients.filters.tracker import LocalTracker, Report, TrackerConfig
 __all__ = [
     "STATE",
     "Association",
+    "Bearing",
+    "BearingTracker",
     "GmPhdFilter",
     "ImmTracker",
     "LocalTracker",

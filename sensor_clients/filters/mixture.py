@@ -100,7 +100,8 @@ class MixtureTracker(LocalTracker):
     def _born(self, returns: Floats, model: MeasurementModel) -> dict[str, Any]:
         weights, parts, spreads = self._components(returns, model)
         means, covariances = moments(weights, parts, spreads)
-        return {"means": means, "covariances": covariances, "weights": weights, "parts": parts, "spreads": spreads}
+        whole = {"means": means, "covariances": covariances, "first": means[:2]}
+        return whole | {"weights": weights, "parts": parts, "spreads": spreads}
 
     def _components(self, returns: Floats, model: MeasurementModel) -> tuple[Floats, Floats, Floats]:
         """Weights (C, M), parts (4, C, M) and spreads (4, 4, C, M) of new tracks from returns (d, M)."""

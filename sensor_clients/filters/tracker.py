@@ -183,7 +183,7 @@ class LocalTracker:
     def _born(self, returns: Floats, model: MeasurementModel) -> dict[str, Any]:
         """The columns of the densities of new tracks, one from each return (d, M)."""
         means, covariances = self._still(*model.locate(returns))
-        return {"means": means, "covariances": covariances}
+        return {"means": means, "covariances": covariances, "first": means[:2]}
 
     def _still(self, place: Floats, spread: Floats) -> tuple[Floats, Floats]:
         """States (4, M) of mean velocity 0 at `place` (2, M), and covariances (4, 4, M) given its `spread`."""
@@ -203,7 +203,6 @@ class LocalTracker:
         new = born | {
             "ids": np.arange(self._next, self._next + count),
             "existence": existence[chosen],
-            "first": born["means"][:2],
             "farthest": np.zeros(count),
             "born": np.full(count, self.time, dtype=np.int64),
             "updated": np.full(count, self.time, dtype=np.int64),

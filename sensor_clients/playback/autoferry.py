@@ -1,8 +1,9 @@
-"""The Autoferry benchmark (Helgesen et al. 2022): lidar, radar and truth of harbour scenes, from JSON files.
+"""The Autoferry benchmark (Helgesen et al. 2022): lidar, radar, cameras and truth of harbour scenes, from JSON.
 
-A file of detections holds one record per scan of one sensor (1 lidar, 2 radar): `time` in Unix seconds,
-`ownshipPosition` (north, east) m from Piren, and `measurement`, [] or [north, east] or
-[[north, ...], [east, ...]] relative to the own ship. Everything here is in the ENU frame about Piren
+A file of detections holds one record per scan of one sensor (1 lidar, 2 radar, 3 IR, 4 EO): `time` in Unix
+seconds, `ownshipPosition` (north, east) m from Piren, and `measurement`, [] or [north, east] or
+[[north, ...], [east, ...]] relative to the own ship; of a camera [bearing, ...] or one bare bearing, rad, clockwise
+from north. Everything here is in the ENU frame about Piren
 (x = east, y = north). The records of some scenarios are not in the order of time.
 """
 
@@ -20,16 +21,18 @@ import numpy as np
 from schemas import Disk, Enu, Height
 from sensor_clients.events import Event, Parameter, Scenario
 from sensor_clients.filters.measurement import Floats
+from sensor_clients.playback.cameras import EO, IR, CameraSensor, CameraTracker
 from sensor_clients.playback.harbour import LIDAR, RADAR, HarbourSensor, HarbourTracker
 
 __all__ = ["PARAMETERS", "PIREN", "SCENARIOS", "SENSORS", "SUMMARY", "Scan", "load", "read_scans", "read_truth"]
 
 SCENARIOS = (2, 3, 4, 5, 6, 13, 16, 17, 22)
-SUMMARY = "lidar and radar of a small ferry among two vessels, about 2 minutes"
+SUMMARY = "lidar, radar and cameras of a small ferry among two vessels, about 2 minutes"
 PIREN = Enu(63.4389029083, 10.39908278, 39.923)
-SENSORS = {"lidar": LIDAR, "radar": RADAR}
+SENSORS: dict[str, HarbourSensor | CameraSensor] = {"lidar": LIDAR, "radar": RADAR, "ir": IR, "eo": EO}
 SECOND = 10**9
 TRUTH_PERIOD = SECOND // 5
+CAMERAS = (IR.sensor_id, EO.sensor_id)
 MOVED = 1.0
 """The info is sent again when the own ship has moved by more than this, m."""
 
@@ -40,7 +43,7 @@ PARAMETERS: tuple[Parameter, ...] = (
 
 
 class Scan(NamedTuple):
-    """One scan: time, ns UTC; own ship's x, y (2,), m; returns' x, y (2, M), m."""
+    """One scan: time, ns UTC; own ship's x, y (2,), m; returns' x, y (2, M), m, or a camera's bearings (1, M), rad."""
 
     time: int
     own: Floats
@@ -55,8 +58,10 @@ def read_scans(path: Path, sensor_id: int) -> list[Scan]:
             if record["sensorID"] != sensor_id:
                 continue
             own = np.array(record["ownshipPosition"], dtype=np.float64)[::-1]
-            relative = np.array(record["measurement"], dtype=np.float64).reshape(2, -1)[::-1]
-            scans.append(Scan(round(record["time"] * SECOND), own, relative + own[:, None]))
+            returns = np.array(record["measurement"], dtype=np.float64)
+            camera = sensor_id in CAMERAS
+            returns = returns.reshape(1, -1) if camera else returns.reshape(2, -1)[::-1] + own[:, None]
+            scans.append(Scan(round(record["time"] * SECOND), own, returns))
         except (KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: a detection cannot be read ({type(error).__name__}: {error})") from None
     return sorted(scans, key=lambda scan: scan.time)
@@ -91,20 +96,22 @@ def _read(path: Path) -> list[Any]:
     return records
 
 
-def sensor_events(sensor: HarbourSensor, scans: list[Scan], seed: int = 0) -> Iterator[Event]:
-    """What the sensor says: its info where the own ship is, and its tracks after every scan."""
-    tracker = HarbourTracker(sensor)
+def sensor_events(sensor: HarbourSensor | CameraSensor, scans: list[Scan], seed: int = 0) -> Iterator[Event]:
+    """What the sensor says: its info where the own ship is, and its tracks after every scan (a camera: after every
+    frame that it uses)."""
+    tracker = HarbourTracker(sensor) if isinstance(sensor, HarbourSensor) else CameraTracker(sensor)
     told = np.full(2, math.inf)
     for scan in scans:
         if not math.dist(told, scan.own) <= MOVED:
             told = scan.own
             yield Event(scan.time, "info", _info(sensor, scan.own))
-        tracker.step(scan.time, scan.own, scan.returns)
+        if not tracker.step(scan.time, scan.own, scan.returns):
+            continue
         fields = tracker.report(scan.time).fields()
         yield Event(scan.time, "tracks", {"frame": PIREN, "height": Height(PIREN.alt, 0.0)} | fields)
 
 
-def _info(sensor: HarbourSensor, own: Floats) -> dict[str, Any]:
+def _info(sensor: HarbourSensor | CameraSensor, own: Floats) -> dict[str, Any]:
     return {
         "frame": PIREN,
         "position": (float(own[0]), float(own[1]), 0.0),
@@ -113,6 +120,7 @@ def _info(sensor: HarbourSensor, own: Floats) -> dict[str, Any]:
         "coverage": Disk(sensor.coverage),
         "detection_probability": sensor.coverage_detection,
         "initiation_delay": sensor.initiation_delay,
+        "may_start": sensor.sensor_id not in CAMERAS,
         "correlation_group": "own-ship",
     }
 
@@ -136,10 +144,11 @@ def load(directory: Path, number: int) -> Scenario:
     detections = directory / f"scenario{number}_detections.json"
     scans = {name: read_scans(detections, sensor.sensor_id) for name, sensor in SENSORS.items()}
     truth = read_truth(directory / f"scenario{number}_groundTruth.json")
-    if not all(scans.values()) or not truth:
+    ranging = [scans[name] for name in ("lidar", "radar")]
+    if not all(ranging) or not truth:
         raise ValueError(f"{detections} or the truth beside it is empty")
-    start = min(found[0].time for found in scans.values())
-    end = max(found[-1].time for found in scans.values())
+    start = min(found[0].time for found in ranging)
+    end = max(found[-1].time for found in ranging)
     return Scenario(
         name=f"autoferry:{number}",
         summary=SUMMARY,
@@ -147,6 +156,6 @@ def load(directory: Path, number: int) -> Scenario:
         duration=(end - start) / SECOND,
         origin="replay",
         parameters=PARAMETERS,
-        sensors={name: partial(sensor_events, SENSORS[name], found) for name, found in scans.items()},
+        sensors={name: partial(sensor_events, SENSORS[name], found) for name, found in scans.items() if found},
         truth=partial(truth_events, truth, start, end),
     )

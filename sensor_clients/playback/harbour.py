@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -12,7 +14,7 @@ from sensor_clients.events import Parameter
 from sensor_clients.filters import LocalTracker, Position, Report, TrackerConfig
 from sensor_clients.filters.measurement import Floats
 
-__all__ = ["LIDAR", "RADAR", "HarbourSensor", "HarbourTracker", "cluster"]
+__all__ = ["LIDAR", "RADAR", "ClutterMap", "HarbourSensor", "HarbourTracker", "cluster", "parameters"]
 
 SECOND = 10**9
 
@@ -65,15 +67,19 @@ class HarbourSensor:
 
     def parameters(self) -> list[Parameter]:
         """One row for `sensor-client list` per number."""
-        rows = [
-            Parameter(f"{self.name} {field.name}", str(getattr(self, field.name)), SOURCES.get(field.name, TUNED))
-            for field in fields(self)
-            if field.name not in ("name", "sensor_id", "tracker")
-        ]
-        config = self.tracker
-        rows.append(Parameter(f"{self.name} tracker motion", f"{config.motion.kind}, q = {config.motion.q:g}", TUNED))
-        names = [field.name for field in fields(config) if field.name not in ("motion", "cubature")]
-        return rows + [Parameter(f"{self.name} tracker {name}", str(getattr(config, name)), TUNED) for name in names]
+        return parameters(self, self.tracker, SOURCES)
+
+
+def parameters(sensor: Any, config: TrackerConfig, sources: Mapping[str, str]) -> list[Parameter]:
+    """One row per number of the sensor and of its tracker's `config`, each with its source, or else `TUNED`."""
+    rows = [
+        Parameter(f"{sensor.name} {field.name}", str(getattr(sensor, field.name)), sources.get(field.name, TUNED))
+        for field in fields(sensor)
+        if field.name not in ("name", "sensor_id", "tracker")
+    ]
+    rows.append(Parameter(f"{sensor.name} tracker motion", f"{config.motion.kind}, q = {config.motion.q:g}", TUNED))
+    names = [field.name for field in fields(config) if field.name not in ("motion", "cubature")]
+    return rows + [Parameter(f"{sensor.name} tracker {name}", str(getattr(config, name)), TUNED) for name in names]
 
 
 LIDAR = HarbourSensor(
@@ -164,18 +170,21 @@ def cluster(returns: Floats, distance: float) -> Floats:
 class ClutterMap:
     """Intensity of false returns, learned from those that no reported track claims, what lies still among them:
     a gamma prior of `prior` (1/m2 and scan) worth `scans` scans, and a Gaussian kernel of `sigma` m about every
-    return since."""
+    return since. `angles`: the returns are bearings, (1, M) rad, and so are the units."""
 
-    def __init__(self, prior: float, sigma: float, scans: float) -> None:
-        self._prior, self._sigma, self._scans = prior, sigma, scans
-        self._places: Floats = np.zeros((2, 0))
+    def __init__(self, prior: float, sigma: float, scans: float, angles: bool = False) -> None:
+        self._prior, self._sigma, self._scans, self._angles = prior, sigma, scans, angles
+        self._places: Floats = np.zeros((1 if angles else 2, 0))
         self._weights: Floats = np.zeros(0)
         self._learned = 0
 
     def intensity(self, places: Floats) -> Floats:
         """Intensity (M,) at places (2, M)."""
-        squared = np.sum((places[:, :, None] - self._places[:, None]) ** 2, axis=0)
-        kernel = np.exp(-0.5 * squared / self._sigma**2) / (2 * np.pi * self._sigma**2)
+        away = places[:, :, None] - self._places[:, None]
+        if self._angles:
+            away = (away + np.pi) % (2 * np.pi) - np.pi
+        squared = np.sum(away**2, axis=0)
+        kernel = np.exp(-0.5 * squared / self._sigma**2) / (2 * np.pi * self._sigma**2) ** (len(places) / 2)
         return np.asarray((self._prior * self._scans + kernel @ self._weights) / (self._scans + self._learned))
 
     def learn(self, returns: Floats, unused: Floats) -> None:
@@ -193,8 +202,8 @@ class HarbourTracker:
         self.tracker = LocalTracker(sensor.tracker)
         self.clutter = ClutterMap(sensor.clutter, sensor.map_sigma, sensor.map_scans)
 
-    def step(self, time: int, own: Floats, returns: Floats) -> None:
-        """One scan stamped `time`, ns: own ship's place (2,), returns (2, M) in the same frame, m."""
+    def step(self, time: int, own: Floats, returns: Floats) -> bool:
+        """One scan stamped `time`, ns: own ship's place (2,), returns (2, M) in the same frame, m. Always used."""
         sensor = self.sensor
         sight = returns - own[:, None]
         distance = np.hypot(*sight)
@@ -219,6 +228,7 @@ class HarbourTracker:
             detection,
         )
         self.clutter.learn(returns, unused)
+        return True
 
     def report(self, time: int) -> Report:
         """The confirmed tracks, predicted to `time`, ns."""
