@@ -8,8 +8,9 @@ order (source, epoch, id) and ties go to the first, so the order of arrival does
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TypeVar
+from bisect import bisect_left
+from collections.abc import Iterator
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +23,13 @@ __all__ = ["by_size", "candidate_pairs", "cluster", "leave_one_out", "pair_dista
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Label = TypeVar("Label", bound=np.generic)
+
+TIERS = (8, 64)
+"""Neighbours sought of a row, and again of one that has as many; one that has the last number is crowded."""
+CROWD = 256
+"""Partners sought of a crowded row, shared evenly between the sources."""
+CHUNK = 4096
+"""Rows or pairs worked on at a time: bounds memory, and how long a signal has to wait."""
 
 
 def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
@@ -37,7 +45,11 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
 
 
 def uniform_ci(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
-    """Covariance intersection with equal weights: (k, n, B), (k, n, n, B) -> (n, B), (n, n, B)."""
+    """Covariance intersection with equal weights: (k, n, B), (k, n, n, B) -> (n, B), (n, n, B).
+
+    Where rounding leaves no sound result (sources with a nearly singular correlation), the source with the
+    smallest determinant stands for all.
+    """
     if len(means) == 1:
         return means[0], covariances[0]
     information = linalg.inverse(covariances[0])
@@ -47,7 +59,14 @@ def uniform_ci(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
         information = information + inverse
         vector = vector + linalg.matvec(inverse, mean)
     covariance = linalg.inverse(information)
-    return linalg.matvec(covariance, vector), covariance * float(len(means))
+    x, C = linalg.matvec(covariance, vector), covariance * float(len(means))
+    bad = np.flatnonzero(~(linalg.is_positive_definite(C) & np.isfinite(x).all(axis=0)))
+    if len(bad):
+        size = np.stack([linalg.logdet(P[:, :, bad]) for P in covariances])
+        best = np.argmin(np.where(np.isfinite(size), size, np.inf), axis=0)
+        x[:, bad] = means[best, :, bad].T
+        C[:, :, bad] = np.moveaxis(covariances[best, :, :, bad], 0, 2)
+    return x, C
 
 
 def leave_one_out(labels: NDArray[np.generic], means: Floats, covariances: Floats) -> Floats:
@@ -67,63 +86,124 @@ def leave_one_out(labels: NDArray[np.generic], means: Floats, covariances: Float
 
 def pair_distance(means: Floats, covariances: Floats, i: Ints, j: Ints) -> tuple[Floats, Floats]:
     """d2 and log det(Pi + Pj) of the pairs (i, j), each (K,)."""
-    total = covariances[:, :, i] + covariances[:, :, j]
-    return linalg.quadratic(total, means[:, i] - means[:, j]), linalg.logdet(total)
+    distance, spread = np.empty(len(i)), np.empty(len(i))
+    for part in linalg.blocks(len(means), len(i)):
+        a, b = i[part], j[part]
+        both = covariances[:, :, a] + covariances[:, :, b]
+        distance[part] = linalg.quadratic(both, means[:, a] - means[:, b])
+        spread[part] = linalg.logdet(both)
+    return distance, spread
 
 
-def candidate_pairs(positions: Floats, sigma: Floats, reach: float) -> tuple[Ints, Ints]:
-    """All i < j with |position difference| <= reach (sigma_i + sigma_j): a superset of the gated pairs.
+def candidate_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints) -> tuple[Ints, Ints]:
+    """Pairs i < j of different sources with |xi - xj|^2 <= reach^2 (sigma_i^2 + sigma_j^2), in order: a superset
+    of the gated ones, but for crowds.
 
-    positions (d, M), sigma (M,) the largest standard deviation of each position. Rows are sorted into octaves
-    of sigma with one tree each, so that a few vague tracks do not make every pair a candidate.
+    positions (d, M); sigma (M,) no less than the largest standard deviation of each position; source (M,), -1
+    for a global track, which pairs with every row. A row that is not finite has no partner. Rows are sorted
+    into octaves of sigma with one tree each and sought from the sharper side, so that a few vague tracks do
+    not make every pair a candidate.
+
+    A row with more than some 64 neighbours no sharper than itself is crowded: of those only the nearest are
+    sure to be among its partners, 256 shared evenly between the sources and at least one of each. So memory
+    and time are bounded by rows times max(256, sources), even if all tracks coincide. Between equally near
+    ones (to within a thousandth of the smallest sigma) the place in the canonical order decides: coincident
+    sources are paired first with first, second with second.
     """
-    octave = np.ceil(np.log2(np.maximum(sigma, 1e-9))).astype(np.int64)
-    groups = [(float(2.0**level), np.flatnonzero(octave == level)) for level in np.unique(octave)]
-    trees = [cKDTree(positions[:, rows].T) for _, rows in groups]
-    firsts: list[Ints] = []
-    seconds: list[Ints] = []
+    count = len(sigma)
+    fit = np.flatnonzero(np.isfinite(positions).all(axis=0) & np.isfinite(sigma))
+    sigma = np.maximum(sigma, 1e-9)
+    names, rank = [], np.zeros(count)
+    for labels, rows in by_size(source[fit]):
+        names += labels.tolist()
+        rank[fit[rows]] = np.arange(rows.shape[1])
+    points = np.vstack([positions, rank * (1e-3 * sigma[fit].min(initial=1.0) / max(count, 1))]).T
+    keys: list[Ints] = [np.zeros(0, dtype=np.intp)]
+
+    def keep(one: Ints, two: Ints) -> None:
+        square = ((positions[:, one] - positions[:, two]) ** 2).sum(axis=0)
+        near = square <= (1 + 1e-9) * reach**2 * (sigma[one] ** 2 + sigma[two] ** 2)
+        near &= (one != two) & ((source[one] != source[two]) | (source[one] < 0))
+        one, two = one[near], two[near]
+        keys.append(np.minimum(one, two) * count + np.maximum(one, two))
+
+    octave = np.ceil(np.log2(sigma[fit]))
+    groups = [(float(2.0**level), fit[octave == level]) for level in np.unique(octave)]
+    trees = [cKDTree(points[rows]) for _, rows in groups]
+    crowded: list[Ints] = [np.zeros(0, dtype=np.intp)]
     for a, (size_a, rows_a) in enumerate(groups):
-        for b in range(a, len(groups)):
-            size_b, rows_b = groups[b]
-            found = trees[a].query_ball_tree(trees[b], reach * (size_a + size_b))
-            lengths = np.fromiter(map(len, found), dtype=np.intp, count=len(found))
-            one = np.repeat(rows_a, lengths)
-            flat = np.fromiter((k for near in found for k in near), dtype=np.intp, count=int(lengths.sum()))
-            two = rows_b[flat]
-            chosen = one < two if a == b else np.ones(len(one), dtype=np.bool_)
-            firsts.append(np.minimum(one, two)[chosen])
-            seconds.append(np.maximum(one, two)[chosen])
-    i = np.concatenate(firsts) if firsts else np.zeros(0, dtype=np.intp)
-    j = np.concatenate(seconds) if seconds else np.zeros(0, dtype=np.intp)
-    return i, j
+        for rows in _chunks(rows_a):
+            found = np.zeros(len(rows), dtype=np.intp)
+            for (size_b, rows_b), tree in zip(groups[a:], trees[a:], strict=True):
+                bound = 1.001 * reach * (size_a + size_b) + 0.001 * size_a
+                seek = np.flatnonzero(found < TIERS[-1])
+                for k in TIERS:
+                    one, two, number = _nearest(tree, points[rows[seek]], k, bound)
+                    full = number == k
+                    keep(rows[seek[one[~full[one]]]], rows_b[two[~full[one]]])
+                    found[seek] += np.where(full & (k < TIERS[-1]), 0, number)
+                    seek = seek[full]
+            crowded.append(rows[found >= TIERS[-1]])
+    for name in names if any(map(len, crowded)) else ():
+        rows_b = fit[source[fit] == name]
+        tree = cKDTree(points[rows_b])
+        for rows in _chunks(np.concatenate(crowded)):
+            rows = rows[(source[rows] != name) | (name < 0)]
+            one, two, _ = _nearest(tree, points[rows], max(1, CROWD // len(names)), np.inf)
+            keep(rows[one], rows_b[two])
+    key = np.sort(np.concatenate(keys))
+    key = key[np.diff(key, prepend=-1) > 0]
+    return key // max(count, 1), key % max(count, 1)
+
+
+def _chunks(rows: Ints) -> Iterator[Ints]:
+    return (rows[start : start + CHUNK] for start in range(0, len(rows), CHUNK))
+
+
+def _nearest(tree: Any, points: Floats, k: int, bound: float) -> tuple[Ints, Ints, Ints]:
+    """The k nearest of each point (R, d) within `bound`, as (index of the point, index in the tree), and how
+    many each has (R,)."""
+    _, index = tree.query(points, k=np.arange(1, k + 1), distance_upper_bound=bound)
+    there = index < tree.n
+    return np.nonzero(there)[0], index[there], there.sum(axis=1)
 
 
 def cluster(
-    i: Ints, j: Ints, cost: Floats, members: Sequence[int], whole: Sequence[bool]
+    i: Ints, j: Ints, cost: Floats, members: NDArray[Any], whole: NDArray[np.bool_]
 ) -> tuple[list[int], list[tuple[int, int, float]]]:
     """Greedy complete-link clustering of nodes under "at most one track per source".
 
-    (i, j) are the gated pairs and `cost` their rank; members[k] is the set of sources of node k as bits;
+    (i, j), i < j, are the gated pairs and `cost` their rank; members[k] is the set of sources of node k as bits;
     whole[k] says that the node is a global track, of which a cluster holds at most one. Two clusters are
     joined when every pair across them is gated and their sources are disjoint, cheapest pair first. Returns
     for each node the smallest node of its cluster, and the joins made as (node, node, cost).
     """
-    root = list(range(len(members)))
-    nodes = {k: [k] for k in root}
-    bits, holds = list(members), list(whole)
-    gated = set(zip(i.tolist(), j.tolist(), strict=True))
+    count = len(members)
+    root, bits, holds = np.arange(count), members.copy(), whole.copy()
+    nodes: dict[int, list[int]] = {}
+    gated = memoryview(np.sort(i * count + j))
     joins: list[tuple[int, int, float]] = []
-    for at in np.lexsort((j, i, cost)).tolist():
-        first, second = int(i[at]), int(j[at])
-        a, b = sorted((root[first], root[second]))
-        if a == b or bits[a] & bits[b] or (holds[a] and holds[b]):
-            continue
-        if not all(((x, y) if x < y else (y, x)) in gated for x in nodes[a] for y in nodes[b]):
-            continue
-        for node in nodes[b]:
-            root[node] = a
-        nodes[a] += nodes.pop(b)
-        bits[a] |= bits[b]
-        holds[a] = holds[a] or holds[b]
-        joins.append((first, second, float(cost[at])))
-    return root, joins
+
+    def has(x: int, y: int) -> bool:
+        key = min(x, y) * count + max(x, y)
+        at = bisect_left(gated, key)
+        return at < len(gated) and gated[at] == key
+
+    for pairs in _chunks(np.lexsort((j, i, cost))):
+        a, b = root[i[pairs]], root[j[pairs]]
+        # what cannot be joined now never can: clusters only grow
+        pairs = pairs[(a != b) & ((bits[a] & bits[b]) == 0) & ~(holds[a] & holds[b])]
+        for first, second, price in zip(i[pairs].tolist(), j[pairs].tolist(), cost[pairs].tolist(), strict=True):
+            a, b = sorted((int(root[first]), int(root[second])))
+            if a == b or bits[a] & bits[b] or (holds[a] and holds[b]):
+                continue
+            left, right = nodes.get(a, [a]), nodes.get(b, [b])
+            if not all(has(x, y) for x in left for y in right if {x, y} != {first, second}):
+                continue
+            root[right] = a
+            nodes[a] = left + right
+            nodes.pop(b, None)
+            bits[a] |= bits[b]
+            holds[a] |= holds[b]
+            joins.append((first, second, price))
+    return root.tolist(), joins

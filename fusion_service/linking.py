@@ -80,18 +80,22 @@ class Linker:
         mean = np.concatenate([mean[:, known], rows.tracks.mean[:, free]], axis=1)
         covariance = np.concatenate([covariance[:, :, known], rows.tracks.covariance[:, :, free]], axis=2)
         masks = np.concatenate([masks[known], bits[free]])
-        i, j, distance, spread = self._gated(mean, covariance, masks)
+        source = np.concatenate([np.full(count, -1), rows.source[free]])
+        i, j, distance, spread = self._gated(mean, covariance, masks, source)
         both = j < count
         agreements = [
             (int(picture.id[known[a]]), int(picture.id[known[b]]), float(d))
             for a, b, d in zip(i[both], j[both], distance[both], strict=True)
         ]
         if len(free):
-            whole = [k < count for k in range(mean.shape[1])]
-            root, _ = cluster(i[~both], j[~both], (distance + spread)[~both], masks.tolist(), whole)
-            near = dict(zip(zip(i.tolist(), j.tolist(), strict=True), distance.tolist(), strict=True))
-            to_root = np.array([near.get((r, count + k), np.nan) for k, r in enumerate(root[count:])])
-            picture = self._settle(rows, free, picture, known, np.array(root), to_root, step, time, journal)
+            nodes = np.arange(len(source))
+            root = np.array(cluster(i[~both], j[~both], (distance + spread)[~both], masks, nodes < count)[0])
+            key, wanted = i * len(nodes) + j, (root * len(nodes) + nodes)[count:]
+            at = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
+            to_root = np.full(len(free), np.nan)
+            if len(key):
+                to_root = np.where(key[at] == wanted, distance[at], np.nan)
+            picture = self._settle(rows, free, picture, known, root, to_root, step, time, journal)
         return picture, agreements
 
     def _nodes(
@@ -110,10 +114,12 @@ class Linker:
             masks[at] = np.bitwise_or.reduce(bits[chosen], axis=1)
         return mean, covariance, masks, bits
 
-    def _gated(self, mean: Floats, covariance: Floats, masks: NDArray[Any]) -> tuple[Ints, Ints, Floats, Floats]:
-        """Pairs i < j within the gate that share no source, with d2 and log det."""
+    def _gated(
+        self, mean: Floats, covariance: Floats, masks: NDArray[Any], source: Ints
+    ) -> tuple[Ints, Ints, Floats, Floats]:
+        """Pairs i < j within the gate that share no source, in order, with d2 and log det."""
         sigma = np.sqrt(sum(covariance[place, place] for place in self._places))
-        i, j = candidate_pairs(mean[self._places], sigma, float(np.sqrt(self._gate)))
+        i, j = candidate_pairs(mean[self._places], sigma, float(np.sqrt(self._gate)), source)
         disjoint = (masks[i] & masks[j]) == 0
         i, j = i[disjoint], j[disjoint]
         distance, spread = pair_distance(mean, covariance, i, j)
