@@ -4,9 +4,10 @@ Public layout in and out, one thread, its CPU time. Each rule is timed in turn w
 best of several rounds of each is compared, since a shared machine drifts by more than the rules differ:
 
   (a) the same B fusions by the naive rule with stacked `np.linalg.inv`,
-  (b) a loop over fusions that finds the weights with `scipy.optimize` (some of them, scaled up).
+  (b) a loop over fusions that finds the weights with `scipy.optimize` (some of them, scaled up),
+  (c) where `stonesoup` can be imported: a loop of its `ChernoffUpdater`, which has fixed weights.
 
-`/(a)` is time over (a)'s: smaller is better. `x(b)` is how many times faster than (b): larger is better.
+`/(a)` is time over (a)'s: smaller is better. `x(b)`, `x(c)`: how many times faster than these.
 """
 
 import os
@@ -36,6 +37,13 @@ CASES: tuple[Case, ...] = (
     ("bci", {"criterion": "trace", "max_correlation": 0.5}),
     ("hmd-ga", {"criterion": "det"}),
     ("hmd-ga", {"criterion": "trace"}),
+    ("ici", {"criterion": "det"}),
+    ("ici", {"criterion": "trace"}),
+    ("ei", {}),
+    ("fast-ci", {}),
+    ("aa", {}),
+    ("aa", {"criterion": "diversity"}),
+    ("cu", {}),
 )
 
 
@@ -64,7 +72,14 @@ def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
             C = np.linalg.inv(total - A)
             c = np.einsum("ijk,ik->ij", C, y.sum(axis=0) - y)
 
+        dets = np.linalg.slogdet(covariances)[1]
+
         def information(w: Array) -> Array:
+            if rule == "ici":
+                return np.asarray(A.sum(axis=0) - np.linalg.inv(np.einsum("i,ijk->jk", w, covariances)))  # noqa: B023
+            if rule == "aa":
+                r = means - w @ means  # noqa: B023
+                return np.asarray(np.einsum("i,ijk->jk", w, covariances) + (r.T * w) @ r)  # noqa: B023
             if rule == "hmd-ga":
                 r = c - w @ c  # noqa: B023
                 return np.asarray(np.einsum("i,ijk->jk", w, C) + (r.T * w) @ r)  # noqa: B023
@@ -72,6 +87,8 @@ def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
 
         def cost(w: Array) -> float:
             M = information(w)
+            if rule == "aa":
+                return float(w @ dets - np.linalg.slogdet(M)[1])  # noqa: B023
             return float(-np.linalg.det(M) if criterion == "det" else np.trace(np.linalg.inv(M)))
 
         if N == 2:
@@ -86,16 +103,46 @@ def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
             )
 
 
+def chernoff() -> Callable[[Array, Array], None] | None:
+    """Yardstick (c), for pairs; None without Stone Soup."""
+    try:
+        from stonesoup.models.measurement.linear import LinearGaussian
+        from stonesoup.types.detection import GaussianDetection
+        from stonesoup.types.hypothesis import SingleHypothesis
+        from stonesoup.types.prediction import GaussianStatePrediction
+        from stonesoup.updater.chernoff import ChernoffUpdater
+    except ImportError:
+        return None
+
+    def loop(x: Array, P: Array) -> None:
+        n = x.shape[-1]
+        model = LinearGaussian(ndim_state=n, mapping=list(range(n)), noise_covar=np.zeros((n, n)))
+        updater = ChernoffUpdater(measurement_model=model)
+        for means, covariances in zip(x, P, strict=True):
+            one = GaussianStatePrediction(means[0][:, None], covariances[0])
+            other = GaussianDetection(means[1][:, None], covar=covariances[1], measurement_model=model)
+            updater.update(SingleHypothesis(one, other))
+
+    return loop
+
+
 def clock(run: Callable[[], object]) -> float:
     start = time.thread_time()
     run()
     return time.thread_time() - start
 
 
-def measure(x: Array, P: Array, rounds: int) -> Iterator[tuple[str, float, float, float]]:
-    """For each case: its name, seconds per batch, ratio to (a), speed-up over (b) (NaN: no weights)."""
+def measure(
+    x: Array, P: Array, rounds: int, third: Callable[[Array, Array], None] | None
+) -> Iterator[tuple[str, float, float, float, float]]:
+    """For each case: its name, seconds per batch, ratio to (a), speed-up over (b) and (c) (NaN: not there)."""
     B, N, _ = x.shape
     some = max(1, min(B, 60 // N))
+    c = (
+        np.nan
+        if third is None or N != 2
+        else min(clock(lambda: third(x[:some], P[:some])) for _ in range(3)) * B / some
+    )
     for rule, options in CASES:
         ours: list[float] = []
         a: list[float] = []
@@ -106,7 +153,7 @@ def measure(x: Array, P: Array, rounds: int) -> Iterator[tuple[str, float, float
             if "criterion" in options and len(b) < 3:
                 b.append(clock(lambda: one_by_one(x[:some], P[:some], rule, options)) * B / some)  # noqa: B023
         name = " ".join((rule, *(str(v) for v in options.values())))
-        yield name, min(ours), min(ours) / min(a), min(b) / min(ours) if b else np.nan
+        yield name, min(ours), min(ours) / min(a), min(b) / min(ours) if b else np.nan, c / min(ours)
 
 
 def main() -> None:
@@ -118,13 +165,17 @@ def main() -> None:
     if not quick:
         sizes += [(n, 2, B) for n in (2, 6) for B in (1, 20, 1000, 10_000)]
         sizes += [(4, N, B) for N in (3, 5, 20) for B in (1, 1000)]
-    print(f"{'n':>2} {'N':>3} {'B':>6}  {'rule':<20} {'us/fusion':>10} {'/(a)':>7} {'x(b)':>7}")
+    third = chernoff()
+    print(f"{'n':>2} {'N':>3} {'B':>6}  {'rule':<20} {'us/fusion':>10} {'/(a)':>7} {'x(b)':>7} {'x(c)':>7}")
     for n, N, B in sizes:
         x, P = estimates(rng, B, N, n)
         rounds = 30 if B * N <= 2000 else 15
-        for name, seconds, over_a, times_b in measure(x, P, 3 if N > 5 else rounds):
-            b = "" if np.isnan(times_b) else f"{times_b:7.0f}"
-            print(f"{n:>2} {N:>3} {B:>6}  {name:<20} {1e6 * seconds / B:10.2f} {over_a:7.2f} {b}", flush=True)
+        for name, seconds, over_a, *times in measure(x, P, 3 if N > 5 else rounds, third):
+            others = " ".join(" " * 7 if np.isnan(t) else f"{t:7.0f}" for t in times)
+            print(
+                f"{n:>2} {N:>3} {B:>6}  {name:<20} {1e6 * seconds / B:10.2f} {over_a:7.2f} {others}".rstrip(),
+                flush=True,
+            )
 
 
 if __name__ == "__main__":

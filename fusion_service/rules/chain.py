@@ -26,12 +26,12 @@ class Pair:
     mean: FloatArray  # (n, B)
     covariance: FloatArray  # (n, n, B)
     weights: FloatArray  # (2, B)
-    gain: FloatArray  # (n, n, B), of the second source
+    gain: FloatArray | None  # (n, n, B), of the second source, if asked for
     condition: FloatArray  # (B,)
     gap: FloatArray  # (B,)
 
 
-Step = Callable[[Sources, FloatArray | None], Pair]
+Step = Callable[[Sources, FloatArray | None, bool], Pair]
 
 
 def canonical(sources: Sources) -> NDArray[np.intp]:
@@ -69,8 +69,8 @@ def pairwise(step: Step, sources: Sources, weights: FloatArray | None, influence
     if N == 1:
         return alone(sources, influence)
     if N == 2:
-        pair = step(sources, weights)
-        share = linalg.trace(pair.gain) / n if influence else None
+        pair = step(sources, weights, influence)
+        share = None if pair.gain is None else linalg.trace(pair.gain) / n
         shares = None if share is None else np.stack([1.0 - share, share])
         return Result(pair.mean, pair.covariance, pair.weights, shares, pair.condition, pair.gap)
     order = canonical(sources)
@@ -88,12 +88,12 @@ def pairwise(step: Step, sources: Sources, weights: FloatArray | None, influence
             both = so_far + given[k]
             t = np.where(both > 0.0, so_far / both, 0.5)
             t = np.stack([t, 1.0 - t])
-        pair = step(two, t)
+        pair = step(two, t, influence)
         mean, P = pair.mean, pair.covariance
         worst, gap = np.maximum(worst, pair.condition), np.maximum(gap, pair.gap)
         w[:k] *= pair.weights[0]
         w[k] = pair.weights[1]
-        if influence:
+        if pair.gain is not None:
             gains[:, :, :k] -= linalg.product(pair.gain[:, :, None], gains[:, :, :k])
             gains[:, :, k] = pair.gain
     out = np.empty_like(w)

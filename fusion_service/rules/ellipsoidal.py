@@ -39,7 +39,7 @@ def ei(sources: Sources, weights: FloatArray | None, influence: bool) -> Result:
     return replace(result, weights=np.full_like(result.weights, np.nan))
 
 
-def _pair(two: Sources, weights: FloatArray | None) -> Pair:
+def _pair(two: Sources, weights: FloatArray | None, influence: bool) -> Pair:
     T, inverse, r, grown = pencil(two.covariances[:, :, 0], two.covariances[:, :, 1])
     better = np.minimum(r, 1.0)
     small = ETA / (np.maximum(r, 1.0 / r) - 1.0 + 2.0 * ETA)

@@ -38,6 +38,7 @@ from .sources import Result, Sources, condition, weighted_sum
 LIMIT = 6
 """Up to this dimension the weights for det come from symmetric functions; rounding spoils them above."""
 ROUNDS = 100
+Slope = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 FLAT = 1e-10
 """Slopes below this, relatively, do not matter: the weight stays at a half."""
 DONE = 1e-11
@@ -49,7 +50,7 @@ def ici(sources: Sources, weights: FloatArray | None, influence: bool, *, criter
     return pairwise(partial(_pair, criterion), sources, weights, influence)
 
 
-def _pair(criterion: str, two: Sources, weights: FloatArray | None) -> Pair:
+def _pair(criterion: str, two: Sources, weights: FloatArray | None, influence: bool) -> Pair:
     P, A = two.covariances, two.information
     if weights is None:
         t = _best(criterion, two)
@@ -61,30 +62,53 @@ def _pair(criterion: str, two: Sources, weights: FloatArray | None) -> Pair:
     everything = weighted_sum(A)
     M = everything - V
     fused = linalg.inverse(M)
-    gain = product(fused, A[:, :, 1] - w[1] * V)
     # M is a difference: what is lost in it is tr(P sum P_i^-1) / n >= 1
     worst = np.maximum(two.condition, condition(G, V)) * inner(fused, everything) / len(M)
     gap = np.zeros_like(worst)
     if weights is None:
         half = product(V, fused)
         if criterion == "det":
-            slope = inner(product(half, V)[:, :, None], P)
+            slope = inner(_lower_product(half, V)[:, :, None], P)
         else:
-            slope = inner(product(half, half.swapaxes(0, 1))[:, :, None], P) / trace(fused)
+            slope = inner(_lower_product(half, half.swapaxes(0, 1))[:, :, None], P) / trace(fused)
         gap = simplex.gap(w, -slope)
-    mean = two.means[:, 0] + linalg.matvec(gain, two.spread[:, 1])
-    return Pair(mean, fused, w, gain, np.maximum(worst, condition(M, fused)), gap)
+    second = A[:, :, 1] - w[1] * V
+    return Pair(
+        two.means[:, 0] + linalg.matvec(fused, linalg.matvec(second, two.spread[:, 1])),
+        fused,
+        w,
+        product(fused, second) if influence else None,
+        np.maximum(worst, condition(M, fused)),
+        gap,
+    )
+
+
+def _lower_product(A: FloatArray, B: FloatArray) -> FloatArray:
+    """The lower triangle of A B."""
+    out = np.empty_like(A)
+    for i in range(len(A)):
+        row = A[i, 0] * B[0, : i + 1]
+        for k in range(1, len(A)):
+            row += A[i, k] * B[k, : i + 1]
+        out[i, : i + 1] = row
+    return out
 
 
 def _best(criterion: str, two: Sources) -> FloatArray:
     """w_1 (B,) with the smallest det P or trace P."""
     P = two.covariances
+    slope: Slope
     if criterion == "det" and two.fast and len(P) <= LIMIT:
-        return _root(_symmetric_slope, _symmetric_functions(two))
+        slope, data = _symmetric_slope, _symmetric_functions(two)
+        ends = data[-2, 0] / data[-1, 0], data[1, 0]
+        return _root(slope, data, ends[0][0] - ends[0][1], ends[1][1] - ends[1][0])
     T, _, r, _ = pencil(P[:, :, 0], P[:, :, 1])
     if criterion == "det":
-        return _root(_det_slope, r[:, None])
-    return _root(_trace_slope, np.stack([r, total(T * T)], axis=1))
+        slope, data = _det_slope, r[:, None]
+    else:
+        slope, data = _trace_slope, np.stack([r, total(T * T)], axis=1)
+    zero, one = (slope(np.full_like(r[0], t), data)[0] for t in (0.0, 1.0))
+    return _root(slope, data, zero, one)
 
 
 def _det_slope(t: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -106,26 +130,16 @@ def _trace_slope(t: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArra
 
 def _symmetric_slope(t: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
     """As `_det_slope`, from `_symmetric_functions`."""
-    (f, df, ddf), power = _forms(data), [np.ones_like(t), t]
-    for _ in range(2, len(f)):
+    n, b, power = len(data) - 1, 1.0 - t, [np.ones_like(t), t]
+    for _ in range(2, n + 1):
         power.append(power[-1] * t)
-    g, dg, ddg = (_form(c, power, 1.0 - t) for c in (f, df, ddf))
-    u, v = dg[0] / g[0], dg[1] / g[1]
-    return u - v, ddg[0] / g[0] - u * u - ddg[1] / g[1] + v * v
-
-
-def _forms(c: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Coefficients of sum c_k (1-t)^k t^(n-k), (n+1, 2, B), and of its two derivatives by t."""
-    out = [c]
-    for _ in range(2):
-        n = len(c) - 1
-        k = np.arange(n, dtype=np.float64)[:, None, None]
-        c = (n - k) * c[:-1] - (k + 1.0) * c[1:] if n else np.zeros_like(c)
-        out.append(c)
-    return out[0], out[1], out[2]
+    (g, h), (dg, dh), (ddg, ddh) = (_form(data[: max(n + 1 - order, 1), order], power, b) for order in range(3))
+    u, v = dg / g, dh / h
+    return u - v, ddg / g - u * u - ddh / h + v * v
 
 
 def _form(c: FloatArray, power: list[FloatArray], b: FloatArray) -> FloatArray:
+    """sum c_k b^k t^(n-k), (2, B), from the powers of t."""
     n = len(c) - 1
     out = np.array(c[n])
     for k in range(n - 1, -1, -1):
@@ -135,7 +149,10 @@ def _form(c: FloatArray, power: list[FloatArray], b: FloatArray) -> FloatArray:
 
 
 def _symmetric_functions(two: Sources) -> FloatArray:
-    """e_k and E_k (n+1, 2, B): the elementary symmetric functions of r and of r^2."""
+    """Coefficients (n+1, 3, 2, B) of sum e_k (1-t)^k t^(n-k), of the same with E_k, and of their derivatives.
+
+    e_k and E_k are the elementary symmetric functions of r and of r^2.
+    """
     P, A = two.covariances, two.information
     n = len(P)
     e = np.empty((n + 1, P.shape[-1]))
@@ -154,7 +171,13 @@ def _symmetric_functions(two: Sources) -> FloatArray:
     for k in range(1, n):
         for j in range(1, min(k, n - k) + 1):
             E[k] += (2.0 if j % 2 == 0 else -2.0) * e[k - j] * e[k + j]
-    return np.stack([e, E], axis=1)
+    out = np.zeros((n + 1, 3, 2, P.shape[-1]))
+    out[:, 0, 0], out[:, 0, 1] = e, E
+    for order in (0, 1):
+        m = n - order
+        index = np.arange(m, dtype=np.float64)[:, None, None]
+        out[:m, order + 1] = (m - index) * out[:m, order] - (index + 1.0) * out[1 : m + 1, order]
+    return out
 
 
 def _interpolated(s: FloatArray, values: FloatArray) -> FloatArray:
@@ -170,10 +193,13 @@ def _interpolated(s: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _root(slope: Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]], data: FloatArray) -> FloatArray:
-    """Where in [0, 1] a rising slope passes zero; the better end if nowhere, a half if it is flat."""
+def _root(slope: Slope, data: FloatArray, zero: FloatArray, one: FloatArray) -> FloatArray:
+    """Where in [0, 1] a rising slope passes zero; the better end if nowhere, a half if it is flat.
+
+    `zero` and `one` are its values at the ends.
+    """
     size = data.shape[-1]
-    zero, one, half = (slope(np.full(size, t, data.dtype), data)[0] for t in (0.0, 1.0, 0.5))
+    half, _ = slope(np.full(size, 0.5, data.dtype), data)
     steep = (zero < -FLAT) | (one > FLAT)
     lo, hi = np.where(half < 0.0, 0.5, 0.0), np.where(half < 0.0, 1.0, 0.5)
     # start where (a + b t) / (1 + c t) through the three values is zero: it can follow a pole

@@ -18,10 +18,7 @@ def integrated(rule: str, x: Array, P: Array, w: Array) -> tuple[Array, Array]:
     axes = [np.linspace(-12, 12, 4001 if n == 1 else 401)] * n
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, n)
     logs = np.stack([multivariate_normal(m, S).logpdf(grid) for m, S in zip(x, P, strict=True)])
-    if rule == "gmd-s":
-        log_p = w @ logs
-    else:
-        log_p = -np.logaddexp.reduce(np.log(w)[:, None] - logs, axis=0)
+    log_p = w @ logs if rule == "gmd-s" else -np.logaddexp.reduce(np.log(w)[:, None] - logs, axis=0)
     p = np.exp(log_p - log_p.max())
     p /= p.sum()
     mean = p @ grid
@@ -57,10 +54,8 @@ def test_alpha_multiplies_the_geometric_mean() -> None:
         fused = fuse("gmd-s", x, P, alpha=alpha, samples=40_000)
         np.testing.assert_allclose(fused.weights, ci.weights, atol=1e-6)
         np.testing.assert_allclose(fused.mean, ci.mean, atol=0.05 * alpha)
-        scale = np.sqrt(ci.covariance.diagonal())
-        np.testing.assert_allclose(
-            fused.covariance / np.outer(scale, scale) / alpha, ci.covariance / np.outer(scale, scale), atol=0.03
-        )
+        scale = np.sqrt(np.outer(ci.covariance.diagonal(), ci.covariance.diagonal()))
+        np.testing.assert_allclose(fused.covariance / scale / alpha, ci.covariance / scale, atol=0.03)
     tight, wide = (fuse("hmd-s", x, P, alpha=alpha, samples=20_000).covariance for alpha in (1.0, 2.0))
     assert np.linalg.eigvalsh(wide - tight).min() > 0.0
 
@@ -116,13 +111,10 @@ def test_two_sources_end_equally_far_from_the_result(n: int) -> None:
         fused = fuse("hmd-ga", x, P, criterion="kl")
         apart = distances(x, P, fused.mean, fused.covariance)
         assert apart[0] == pytest.approx(apart[1], rel=1e-4, abs=1e-6)
-        scan = fuse(
-            "hmd-ga",
-            np.broadcast_to(x, (801, 2, n)),
-            np.broadcast_to(P, (801, 2, n, n)),
-            weights=np.stack([grid, 1 - grid], axis=1),
-        )
-        gap = np.array([np.subtract(*distances(x, P, m, S)) for m, S in zip(scan.mean, scan.covariance, strict=True)])
+        many = np.broadcast_to(x, (801, 2, n)), np.broadcast_to(P, (801, 2, n, n))
+        scan = fuse("hmd-ga", *many, weights=np.stack([grid, 1 - grid], axis=1))
+        both = [distances(x, P, m, S) for m, S in zip(scan.mean, scan.covariance, strict=True)]
+        gap = np.subtract(*np.array(both).T)
         roots = grid[:-1][gap[:-1] * gap[1:] <= 0.0]
         assert np.abs(roots - fused.weights[0]).min() < 2.0 / 800
 
