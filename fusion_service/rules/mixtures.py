@@ -13,14 +13,15 @@
   weight alpha beta zeta / sum. (70) and (73) as printed leave zeta out of the weights.
 * cu-modes: for each such choice, weighed by the product of the alphas: covariance intersection of the modes if every
   two of them agree, (m_i - m_j)' (P_i + P_j)^-1 (m_i - m_j) within the quantile `gate` of chi-square, and their
-  covariance union if they conflict. If one source holds the truth in some mode, that mode keeps its weight, in
-  components that are as conservative as it is.
+  covariance union if they conflict. A mode of any source keeps its weight, spread over components that cover it where
+  the others conflict with it; where they agree, all are taken for right.
 * every rule of `RULES` but those: on the sources' moments; the result has one component.
 
-The samples of a part come from its component of gm-ga, q = prod (alpha_ic N_ic)^w_i. It bounds the part from above:
-alpha N <= f makes the divided density larger only where q is larger too, and the weighted harmonic mean is never above
-the geometric. So no sample weighs more than 1, and nothing has to be chosen between sources; Sharma's choice (74) is
-biased and not used. All parts share their normal draws: a result depends on its sources, `samples` and `seed` only.
+The samples of a part come from its component of gm-ga, q = prod a_i^w_i with a_i = alpha_ic N_ic <= f_i, which bounds
+the part from above. gmd-s: part / q = prod (a_i / f_i)^(1-w_i) <= 1. hmd-s: prod (a_i / f_i) is at most the least
+a_i / f_i, so the part is at most the harmonic mean of the a_i, and that is at most their geometric mean q. So no sample
+weighs more than 1, and nothing has to be chosen between sources; Sharma's choice (74) is biased and not used. All parts
+share their normal draws: a result depends on its sources, `samples` and `seed` only.
 
 All rules take all sources in one step, or (`ici`, `ei`) in the canonical order of `chain`: the order of arrival does
 not matter. Weights are None (the `criterion` decides), "uniform", or given. Criteria of gm-ga, gmd-s and hmd-s:
@@ -88,7 +89,7 @@ MIXTURE_RULES: Mapping[str, Rule] = MappingProxyType(
             Rule("hmd-s", "as conservative as alpha makes it", True, dict(_SAMPLED), "Sharma (66)-(73)"),
             Rule(
                 "cu-modes",
-                "conservative if one source is in one of its modes",
+                "conservative where modes conflict if one of them is, and where they agree if all are",
                 True,
                 {"criterion": "det", "gate": 0.99},
                 "covariance union of modes that conflict, covariance intersection of those that agree",
