@@ -197,3 +197,32 @@ def test_a_track_is_told_once_its_bearing_has_turned() -> None:
         first = first or (k if told else 0)
     assert told == [2]
     assert 10 <= first <= 20, "0.2 rad are ten steps"
+
+
+def test_what_is_not_seen_is_rather_where_it_cannot_be_seen() -> None:
+    """A scan without the bearing, with seeing less likely far off: Bayes over the bank and existence, written out."""
+    tracker = BearingTracker(config(0.0, 1e-3), 6)
+    model = Bearing(0.01, 0.0, EDGES)
+    seen = np.array([0.9, 0.8, 0.6, 0.3, 0.1, 0.0])
+
+    def detection(place: Floats) -> Floats:
+        return np.asarray(seen[np.searchsorted(EDGES, np.hypot(*place)) - 1])
+
+    first = np.array([[0.3]])
+    tracker.step(0, first, model, np.array([1e-3]), np.array([1e-3]), detection)
+    np.testing.assert_allclose(tracker.weights[:, 0], 1 / 6)
+    assert tracker.existence.tolist() == [0.5]
+    tracker.step(SECOND, NONE, model, np.zeros(0), np.zeros(0), detection)
+    missed = (1 - seen) / 6
+    np.testing.assert_allclose(tracker.weights[:, 0], missed / missed.sum(), rtol=1e-9)
+    r = 0.5 * missed.sum() / (0.5 + 0.5 * missed.sum())
+    assert tracker.existence[0] == pytest.approx(r, rel=1e-9)
+    before = tracker.weights[:, 0].copy()
+    tracker.step(2 * SECOND, first, model, np.array([1e-2]), np.array([1e-30]), detection)
+    # The bearing, known to 0.01 rad before as now, is as likely from every interval: they differ by p alone.
+    density = norm.pdf(0.0, 0.0, math.sqrt(2) * 0.01)
+    hit, gone = before * seen * density / 1e-2, before * (1 - seen)
+    np.testing.assert_allclose(tracker.weights[:, 0], (hit + gone) / (hit + gone).sum(), rtol=0.02)
+    odds = r / (1 - r) * (hit + gone).sum()
+    assert tracker.existence[0] == pytest.approx(odds / (1 + odds), rel=0.02)
+    np.testing.assert_allclose(tracker.weights[5, 0] / tracker.weights[0, 0], gone[5] / (hit + gone)[0], rtol=0.02)

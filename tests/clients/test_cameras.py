@@ -11,9 +11,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from processes import Hub, Program, eventually
 
 import schemas
 from fusion_service import densities
+from fusion_service.bus import open_bus
 from sensor_clients.events import Event
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback import autoferry
@@ -150,6 +152,36 @@ def test_what_a_camera_says_can_be_sent(name: str) -> None:
     assert all(schemas.decode(schemas.encode(message)) for message in messages)
     assert not any(codes.any() for codes in schemas.check_numbers(messages))
     assert max(message.counts.max(initial=0) for message in messages if message.counts is not None) > 1
+
+
+def test_a_camera_of_a_recording_reaches_the_bus(hub: Hub, tmp_path: Path) -> None:
+    """Made-up files, a real process: its mixtures arrive as the camera's tracker has them."""
+    start = 1000
+    common: dict[str, Any] = {"measurements": [], "ownshipPosition": [0.0, 0.0]}
+    records: list[dict[str, Any]] = [{"sensorID": k, "time": start, "measurement": [], **common} for k in (1, 2)]
+    for scan in frames(EO, 5.0, 30.0, 3):
+        records.append(
+            {"sensorID": 4, "time": start + scan.time / SECOND, "measurement": scan.returns[0].tolist(), **common}
+        )
+    fix = [{"targetID": 1, "position": [0.0, 60.0, 0.0], "time": float(start)}]
+    (tmp_path / "scenario2_detections.json").write_text(json.dumps(records))
+    (tmp_path / "scenario2_groundTruth.json").write_text(json.dumps([fix]))
+    expected = list(autoferry.load(tmp_path, 2).sensors["eo"](0))
+    assert "ir" not in autoferry.load(tmp_path, 2).sensors, "not in these files"
+    heard: list[schemas.Message] = []
+    main = "import sys; from sensor_clients.cli import main; sys.exit(main(sys.argv[1:]))"
+    common_options = ("--sensor", "eo", "--data", str(tmp_path), "--connect", hub.endpoint, "--speed", "20")
+    with open_bus([hub.endpoint], wait=10) as bus:
+        bus.subscribe("**", lambda key, data: heard.append(schemas.decode(data)), history=8)
+        with Program(main, "playback", "autoferry:2", *common_options) as camera:
+            assert camera.end(20) == (0, "")
+            eventually(lambda: len(heard) >= len(expected))
+    last = [message for message in heard if isinstance(message, schemas.LocalTracks)][-1]
+    assert last.time == expected[-1].time
+    assert last.counts is not None
+    assert last.counts.tolist() == expected[-1].fields["counts"].tolist() != []
+    np.testing.assert_array_equal(last.means, expected[-1].fields["means"])
+    assert any(isinstance(message, schemas.SensorInfo) and not message.may_start for message in heard)
 
 
 @DATA
