@@ -38,6 +38,7 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, picture:
     whole = {
         "v": CHECKPOINT_VERSION,
         "config_hash": config_hash,
+        "kind": intake.config.kind,
         "frame": _pack_frame(intake.frame),
         "sources": {name: _pack_source(source) for name, source in sorted(intake.sources.items())},
         "picture": _pack_columns(picture),
@@ -53,6 +54,8 @@ def unpack_state(blob: bytes, intake: Intake, space: tuple[str, ...]) -> tuple[d
         version = whole["v"]
         if version != CHECKPOINT_VERSION:
             raise CheckpointError(f"the checkpoint is of version {version}, this is {CHECKPOINT_VERSION}")
+        if whole.get("kind", "tracks") != intake.config.kind:
+            raise CheckpointError(f"the checkpoint is of a centre that fuses {whole['kind']}, not {intake.config.kind}")
         if tuple(whole["space"]) != space:
             raise CheckpointError("the checkpoint is in another state space than the config")
         frame = _unpack_frame(whole["frame"])

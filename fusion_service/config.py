@@ -157,9 +157,10 @@ class SourceConfig:
 
 @dataclass(frozen=True)
 class CentreConfig:
-    """All that changes a result of `FusionCentre`."""
+    """All that changes a result of `FusionCentre` or `IntensityCentre`."""
 
     name: str = _setting("centre", _parsed(check_name), "name of this centre in its keys")
+    kind: str = _setting("tracks", _choice("tracks", "intensity"), "what it takes from its sources and fuses")
     space: tuple[str, ...] = _setting(
         ("x", "y", "vx", "vy"), _parsed(check_space, _texts), "state space of the picture"
     )
@@ -190,6 +191,19 @@ class CentreConfig:
     )
     coast: float = _setting(5.0, _DURATION, "seconds a confirmed track lives on without support")
     stale_periods: float = _setting(3.0, _number(1, 1e6), "a source (or track) is stale after so many periods")
+    intensity_rule: str = _setting(
+        "hybrid", _choice("aa", "ga", "hybrid"), "kind = intensity: mean of the intensities; hybrid: number aa, place ga"
+    )
+    intensity_cardinality: str = _setting(
+        "average", _choice("average", "consistent"), "hybrid: the number of targets in places with the same sources"
+    )
+    intensity_extract: str = _setting(
+        "threshold", _choice("threshold", "rank"), "tracks: components above the threshold, or the round(mass) heaviest"
+    )
+    intensity_threshold: float = _setting(0.5, _number(0, 1), "weight above which a component is a track")
+    intensity_prune: float = _setting(1e-3, _number(0, 1), "weight below which a component is dropped")
+    intensity_merge: float = _setting(2.0, _number(0, 100), "d2 below which components of one mixture are merged")
+    intensity_components: int = _setting(500, _whole(1, 5000), "components kept at most")
     max_pending: int = _setting(10_000, _whole(1, 10_000_000), "messages held per source for later steps")
     source_defaults: SourceConfig = _setting(SourceConfig(), lambda v: v, "for every source")
     sources: dict[str, SourceConfig] = _setting({}, _table, "by name, over the defaults")

@@ -1,8 +1,10 @@
 """From queued events to sources with sound tracks: the border where every input is checked, once.
 
 Reasons of refusal, beside those of `schemas.MessageError` (what cannot be decoded) and `schemas.FAULTS` (bad
-numbers): type, muted, loop, future, old-epoch, repeat, late, space, frame, intensity, bad-info,
-too-many-tracks, too-many-sources.
+numbers): type, muted, loop, future, old-epoch, repeat, late, space, frame, intensity (or tracks: what this centre
+does not fuse), length, bad-info, too-many-tracks, too-many-sources.
+
+An intensity stands in its source's table as a complete scan: a track per component, its weight as existence.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from itertools import groupby
 from typing import TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.geodesy import FrameError
@@ -42,6 +45,8 @@ MAX_QUEUED = 50_000
 MAX_COMPONENTS = 500_000
 MAX_EVENTS = 10_000
 MAX_PERIOD = 1e5
+MAX_WEIGHT = 1e3
+"""Expected number in one component of an intensity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +84,7 @@ class Refused:
 
 Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused
 _Queued: TypeAlias = tuple[Message, int]
+_Scan: TypeAlias = LocalTracks | LocalIntensity
 _Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]
 
 
@@ -244,7 +250,7 @@ class Intake:
         return self.sources[name]
 
     def _take(self, messages: list[_Keyed], time: int, last: int, journal: Journal) -> None:
-        tracks: list[tuple[Source, LocalTracks, Entry]] = []
+        tracks: list[tuple[Source, _Scan, Entry]] = []
         for (name, epoch, seq, kind, code, received), message in messages:
             entry = Entry(name, epoch, seq, code)
             known = self.sources.get(name)
@@ -266,7 +272,7 @@ class Intake:
             if isinstance(message, SensorInfo):
                 if source.info is None or seq > source.info.seq:
                     source.info = message
-            elif isinstance(message, LocalTracks):
+            elif isinstance(message, _Scan):
                 source.offset = received - message.time
                 tracks.append((source, message, entry))
         self._apply(tracks, journal)
@@ -291,12 +297,16 @@ class Intake:
             return "late"
         if not set(self.config.space) <= set(message.space):
             return "space"
-        if isinstance(message, LocalIntensity):
-            return "intensity"
+        if isinstance(message, LocalIntensity) is not (self.config.kind == "intensity"):
+            return "intensity" if isinstance(message, LocalIntensity) else "tracks"
         return "" if _fits(message) else "length"
 
-    def _apply(self, items: list[tuple[Source, LocalTracks, Entry]], journal: Journal) -> None:
-        checked = zip(items, check_numbers([item[1] for item in items]), strict=True)
+    def _apply(self, items: list[tuple[Source, _Scan, Entry]], journal: Journal) -> None:
+        codes = check_numbers([item[1] for item in items])
+        checked = [
+            ((source, _as_tracks(message, faults), entry), faults)
+            for (source, message, entry), faults in zip(items, codes, strict=True)
+        ]
         for _, run in groupby(enumerate(checked), key=_run_key):
             batch = [item for _, item in run]
             source, first, _ = batch[0][0]
@@ -333,9 +343,34 @@ def _size(message: Message) -> int:
     return len(message.means) if isinstance(message, (LocalTracks, LocalIntensity)) else 1
 
 
-def _fits(message: LocalTracks) -> bool:
+def _as_tracks(message: _Scan, faults: NDArray[np.uint8]) -> LocalTracks:
+    """An intensity as a complete scan whose ids no other message has; one without a sound component says nothing.
+    A weight above `MAX_WEIGHT` is marked in `faults`."""
+    if isinstance(message, LocalTracks):
+        return message
+    faults[(faults == 0) & (message.weights > MAX_WEIGHT)] = FAULTS.index("weights")
+    header = {one: getattr(message, one) for one in ("source", "epoch", "seq", "sent", "origin", "lineage")}
+    return LocalTracks(
+        **header,
+        time=message.time,
+        complete=not len(faults) or bool((faults == 0).any()),
+        space=message.space,
+        frame=message.frame,
+        height=message.height,
+        ids=np.arange(len(faults), dtype=np.uint64) + np.uint64((message.seq % 2**44) << 20),
+        existence=message.weights,
+        means=message.means,
+        covariances=message.covariances,
+    )
+
+
+def _fits(message: _Scan) -> bool:
     """Whether the arrays of a message that was never encoded belong together."""
-    tracks, n = len(message.ids), len(message.space)
+    n = len(message.space)
+    if isinstance(message, LocalIntensity):
+        total = len(message.weights)
+        return message.means.shape == (total, n) and message.covariances.shape == (total, n, n)
+    tracks = len(message.ids)
     total = tracks if message.counts is None else int(np.sum(message.counts))
     lengths = (message.existence, message.updated, message.counts)
     return (
