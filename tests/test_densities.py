@@ -201,6 +201,18 @@ def test_merging_is_greedy_and_keeps_the_moments(seed: int, n: int, C: int, most
         np.testing.assert_allclose(ours, theirs, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize("method", ["runnalls", "salmond"])
+def test_long_merging_takes_the_same_pairs(method: str) -> None:
+    """Many merges, many mixtures at once: a cost that was not brought up to date would show."""
+    rng = np.random.default_rng(10)
+    mixtures = [random_mixture(rng, 12, 2, 1.0) for _ in range(30)]
+    reduced = reduce_mixtures(Mixtures.of(mixtures), max_components=3, method=method)
+    for i, m in enumerate(mixtures):
+        expected = merge_by_hand(m, 3, method)
+        np.testing.assert_allclose(reduced[i].weights, [m.mass * p[0] for p in expected], rtol=1e-9)
+        np.testing.assert_allclose(reduced[i].covariances, [p[2] for p in expected], rtol=1e-8, atol=1e-10)
+
+
 def test_pruning_and_truncating() -> None:
     m = Mixture([0.5, 0.001, 0.3, 0.199], [[0.0], [1.0], [2.0], [3.0]], np.ones((4, 1, 1)))
     assert reduce_mixture(m, prune=0.01).means.ravel().tolist() == [0.0, 2.0, 3.0]
