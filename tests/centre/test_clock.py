@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import tracemalloc
+from time import process_time
+
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import SECOND, START
@@ -92,6 +96,94 @@ def test_a_long_silence_is_not_stepped_through() -> None:
     assert len(drain(one)) < 10
 
 
+def start(**at: float) -> MessageClock:
+    """A clock on which these sources have their tokens and have each said a time."""
+    one = clock()
+    for name, seconds in at.items():
+        one.presence(name, True)
+        see(one, name, seconds)
+        drain(one)
+    return one
+
+
+WRONG = 1e6
+
+
+@pytest.mark.parametrize("count", [2, 4])
+def test_with_three_or_five_the_majority_is_followed(count: int) -> None:
+    # a client that starts at time 0 locks nobody out, and is not waited for
+    one = start(lost=0.0)
+    names = [f"radar{k}" for k in range(count)]
+    for name in names:
+        one.presence(name, True)
+        see(one, name, WRONG)
+    for second in (1, 2, 3):
+        assert all(see(one, name, WRONG + second) for name in names)
+        assert see(one, "lost", float(second))
+        assert drain(one)[-1] == WRONG + second
+    # and one, or two of five, far ahead move the clock for nobody
+    one = start(**dict.fromkeys(names, 0.0))
+    for k in range(count // 2):
+        one.presence(f"ahead{k}", True)
+    for second in range(1, 200):
+        assert not any(see(one, f"ahead{k}", WRONG + second) for k in range(count // 2))
+        assert all(see(one, name, float(second)) for name in names)
+        assert drain(one) == [second]
+
+
+def test_of_two_the_earlier_is_followed_while_it_moves_and_the_later_once_it_does_not() -> None:
+    one = start(early=0.0)
+    one.presence("late", True)
+    for second in range(1, 200):
+        assert not see(one, "late", WRONG + second)
+        assert see(one, "early", float(second))
+        assert drain(one) == [second]
+    followed = [second for second in range(200, 400) if see(one, "late", WRONG + second)]
+    assert followed == list(range(followed[0], 400))
+    assert 200 + 60 < followed[0] < 200 + 100
+    assert drain(one)[-1] == WRONG + 399
+    # what the other says now is of the past, and holds up nothing
+    assert see(one, "early", 500.0)
+    assert see(one, "late", WRONG + 400)
+    assert drain(one) == [WRONG + 400]
+
+
+def test_two_wild_jumps_while_the_others_pause_are_not_followed() -> None:
+    one = start(a=0.0, b=0.0)
+    assert not see(one, "a", WRONG)
+    assert not see(one, "a", 2 * WRONG)
+    assert not see(one, "a", 3 * WRONG)
+    assert see(one, "b", 1.0)
+
+
+def test_one_that_was_followed_and_crashed_far_behind_holds_up_nobody() -> None:
+    one = start(a=0.0, b=0.0)
+    one.presence("c", True)
+    see(one, "c", 0.0)
+    for second in range(1, 200):
+        see(one, "a", float(second))
+        see(one, "b", float(second))
+        steps = drain(one)
+    assert steps == [199.0]
+
+
+def test_many_names_and_messages_cost_little() -> None:
+    one = clock()
+    one.presence("radar", True)
+    tracemalloc.start()
+    begin = process_time()
+    for k in range(5_000):
+        see(one, f"name{k}", k * 4e-4)
+        one.due()
+    assert see(one, "radar", 2.0)
+    for k in range(20_000):
+        see(one, "radar", 2.0 + k * 5e-5)
+    assert process_time() - begin < 6
+    assert tracemalloc.get_traced_memory()[0] < 2_000_000
+    tracemalloc.stop()
+    assert drain(one) == [0.0, 1.0]
+
+
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 40)), min_size=1, max_size=40))
 def test_steps_are_on_the_grid_grow_and_never_pass_the_front(messages: list[tuple[str, int]]) -> None:
@@ -124,3 +216,17 @@ def test_the_wall_clock_steps_on_its_grid_behind_now_and_skips_what_was_slept_th
     assert one.wait(START + SECOND // 2) == 1.0
     assert one.due(START + 10 * SECOND) == START + 9 * SECOND
     assert one.skipped == 8
+
+
+def test_a_wall_clock_that_is_set_back_says_how_far_and_does_not_step_twice() -> None:
+    one = WallClock(CentreConfig(period=1.0, delay=0.5))
+    assert one.behind(START) == 0.0
+    one.due(START)
+    assert one.due(START + 10 * SECOND + SECOND // 2) == START + 10 * SECOND
+    assert one.behind(START + 10 * SECOND + SECOND // 2) == 0.0
+    back = START - 3590 * SECOND
+    assert one.due(back) is None
+    assert one.behind(back) == 3600.5
+    assert one.due(START + 10 * SECOND) is None
+    assert one.due(START + 11 * SECOND + SECOND // 2) == START + 11 * SECOND
+    assert one.behind(START + 11 * SECOND + SECOND // 2) == 0.0
