@@ -17,20 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service import linalg
-from fusion_service.association import by_size, uniform_ci
 from fusion_service.checkpoint import pack_state, unpack_state
 from fusion_service.config import CentreConfig, centre_config, config_hash
+from fusion_service.densities import Mixtures
+from fusion_service.fusing import fuse_all
 from fusion_service.intake import Event, Intake, Order, Refused, SourceFound, SourceLost
 from fusion_service.journal import Journal
-from fusion_service.lifecycle import advance, empty_picture
+from fusion_service.lifecycle import Picture, advance, empty_picture
 from fusion_service.linking import Linker
-from fusion_service.motion import predict
 from fusion_service.presence import existence_now
-from fusion_service.rows import NO_TRACK, Rows, usable_rows, write_back
-from fusion_service.rules import Fused, fuse_last
+from fusion_service.rows import Rows, predict_tracks, usable_rows, write_back
 from fusion_service.sources import Source
-from schemas import ORIGINS, Entry, GlobalTracks, Local, Status, StepLog
+from schemas import ORIGINS, GlobalTracks, Local, Status, StepLog
 from schemas import messages as words
 
 __all__ = ["FusionCentre", "Order", "Refused", "SourceFound", "SourceLost", "StepResult"]
@@ -109,7 +107,7 @@ class FusionCentre:
         names = self._intake.names()
         journal.name_sources(names)
         self._associate(rows, time)
-        influence = self._fuse(rows, time)
+        self._picture, influence = fuse_all(rows, self._predicted(time), time, self.config, journal)
         self._live(rows, time)
         write_back(rows, self._intake)
         tracks = self._publish(rows, influence, names)
@@ -166,54 +164,20 @@ class FusionCentre:
     def _associate(self, rows: Rows, time: int) -> None:
         linker, journal = self._linker, self._journal
         linker.check(rows, journal)
-        self._picture, agreements = linker.link(rows, self._picture, *self._predicted(time), self._step, time, journal)
+        now = self._predicted(time)
+        self._picture, agreements = linker.link(
+            rows, self._picture, now.mean, now.covariance, self._step, time, journal
+        )
         merged = linker.merge(rows, agreements, self._step, journal)
         self._relink(merged)
         if merged:
             gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
             self._picture = self._picture.take(~gone)
 
-    def _predicted(self, time: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        picture = self._picture
+    def _predicted(self, time: int) -> Picture:
+        picture, config = self._picture, self.config
         dt = np.where(picture.time >= 0, time - picture.time, 0) / 1e9
-        return predict(self.config.motion, self.config.space, picture.mean, picture.covariance, dt)
-
-    def _fuse(self, rows: Rows, time: int) -> NDArray[np.float64]:
-        """Fuse the tracks of every global track at once; influence (M,) of each row, NaN where it has no link."""
-        tracks, picture, config = rows.tracks, self._picture, self.config
-        influence = np.full(len(tracks.id), np.nan)
-        linked = tracks.link != NO_TRACK
-        influence[linked] = 0.0
-        mean, covariance = self._predicted(time)
-        state_time = np.where(picture.time >= 0, time, -1)
-        used = linked if config.memory == "restart" else linked & (tracks.time > tracks.used)
-        chosen = np.flatnonzero(used)
-        for ids, groups in by_size(tracks.link[chosen]):
-            at, members = picture.find(ids), chosen[groups]
-            means = np.ascontiguousarray(np.moveaxis(tracks.mean[:, members], 2, 0))
-            covariances = np.ascontiguousarray(np.moveaxis(tracks.covariance[:, :, members], 3, 0))
-            fused = fuse_last(config.rule, means, covariances, influence=True, **config.rule_options)
-            one, spread, gains = fused.mean, fused.covariance, _influence(fused)
-            old = np.flatnonzero(picture.time[at] >= 0) if config.memory == "recursive" else at[:0]
-            if len(old):
-                again = fuse_last(
-                    "bci",
-                    np.stack([one[:, old], mean[:, at[old]]]),
-                    np.stack([spread[:, :, old], covariance[:, :, at[old]]]),
-                    influence=True,
-                    max_correlation=config.memory_correlation,
-                )
-                one[:, old], spread[:, :, old] = again.mean, again.covariance
-                gains[:, old] *= _influence(again)[0]
-            bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
-            if bad.any():
-                one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
-                self._journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
-            mean[:, at], covariance[:, :, at], state_time[at] = one, spread, time
-            influence[members] = gains.T
-        tracks.used[chosen] = tracks.time[chosen]
-        self._picture = replace(picture, mean=mean, covariance=covariance, time=state_time)
-        return influence
+        return predict_tracks(picture, config.motion, config.space, config.space, dt)
 
     def _live(self, rows: Rows, time: int) -> None:
         tracks, picture, linked = rows.tracks, self._picture, rows.linked()
@@ -256,8 +220,7 @@ class FusionCentre:
             ids=picture.id,
             status=picture.status,
             existence=picture.existence,
-            means=np.ascontiguousarray(picture.mean.T),
-            covariances=np.ascontiguousarray(np.moveaxis(picture.covariance, 2, 0)),
+            **_densities(picture, self.config.publish),
             updated=picture.updated,
             sources=names,
             contributor_counts=counts.astype(np.uint16),
@@ -304,6 +267,17 @@ class FusionCentre:
         }
 
 
-def _influence(fused: Fused) -> NDArray[np.float64]:
-    assert fused.influence is not None
-    return fused.influence
+def _densities(picture: Picture, publish: str) -> dict[str, Any]:
+    """The columns of a message: mixtures as they are, as their moments, or by their heaviest component."""
+    mean, covariance = picture.mean, picture.covariance
+    if len(picture.log_weight) and publish == "mixture":
+        parts = Mixtures(picture.log_weight, picture.part_mean, picture.part_covariance)
+        weights, means, covariances, counts = parts.rows()
+        return {"means": means, "covariances": covariances, "weights": weights, "counts": counts}
+    if len(picture.log_weight) and publish == "mode":
+        heaviest, each = picture.log_weight.argmax(axis=0), np.arange(len(picture.id))
+        mean, covariance = picture.part_mean[:, heaviest, each], picture.part_covariance[:, :, heaviest, each]
+    return {
+        "means": np.ascontiguousarray(mean.T),
+        "covariances": np.ascontiguousarray(np.moveaxis(covariance, 2, 0)),
+    }

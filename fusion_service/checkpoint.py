@@ -13,7 +13,7 @@ import msgpack
 import numpy as np
 
 from fusion_service.lifecycle import Picture, empty_picture
-from fusion_service.sources import Source, Tracks, empty_tracks
+from fusion_service.sources import Source, Tracks, empty_tracks, padded
 from schemas import Ecef, Enu, Frame, Local, SensorInfo, decode, encode
 
 if TYPE_CHECKING:
@@ -97,21 +97,22 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
     return source
 
 
-def _pack_columns(columns: Tracks | Picture) -> dict[str, bytes]:
-    arrays = {one.name: getattr(columns, one.name) for one in fields(columns)}
-    return {
-        name: np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes() for name, array in arrays.items()
-    }
+def _pack_columns(columns: Tracks | Picture) -> dict[str, Any]:
+    packed: dict[str, Any] = {"components": len(columns.log_weight)}
+    for one in fields(columns):
+        array = getattr(columns, one.name)
+        packed[one.name] = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+    return packed
 
 
-def _unpack_columns(packed: dict[str, bytes], like: Columns) -> Columns:
+def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
+    like = padded(like, packed["components"])
+    count = len(packed["id"]) // 8
     arrays = []
     for one in fields(like):
         empty = getattr(like, one.name)
         flat = np.frombuffer(packed[one.name], dtype=empty.dtype.newbyteorder("<")).astype(empty.dtype)
-        arrays.append(flat.reshape(*empty.shape[:-1], -1) if flat.size else empty)
-    if len({array.shape[-1] for array in arrays}) != 1:
-        raise CheckpointError("the checkpoint's columns differ in length")
+        arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)
 
 

@@ -17,6 +17,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+
 from schemas import Ecef, Enu, Frame, Height, Local, Motion, check_name, check_realm, check_space
 
 __all__ = [
@@ -33,6 +35,9 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
+Problems = list[tuple[tuple[str, ...], str]]
+"""What is wrong, with the key where it is."""
 
 
 class ConfigError(ValueError):
@@ -84,6 +89,12 @@ def _rule(value: Any) -> str:
     return _choice(*RULES)(value)
 
 
+def _mixture_rule(value: Any) -> str:
+    from fusion_service.rules.mixtures import MIXTURE_RULES
+
+    return _choice("moments", *MIXTURE_RULES)(value)
+
+
 def _flag(value: Any) -> bool:
     if type(value) is not bool:
         raise ValueError(f"is {value!r}, must be true or false")
@@ -116,23 +127,34 @@ def _build(kind: type[T], value: Any) -> T:
     if isinstance(value, kind):
         return value
     table = _table(value)
-    try:
-        return kind(**table)
-    except TypeError:
-        wanted = [one.name for one in fields(kind)]  # type: ignore[arg-type]
-        raise ValueError(f"has the keys {', '.join(table) or 'none'}, wants: {', '.join(wanted)}") from None
+    known = {one.name: one.type for one in fields(kind)}  # type: ignore[arg-type]
+    needed = {one.name for one in fields(kind) if one.default is dataclasses.MISSING}  # type: ignore[arg-type]
+    if not needed <= set(table) <= set(known):
+        raise ValueError(f"has the keys {', '.join(table) or 'none'}, wants: {', '.join(known)}")
+    for name, one in table.items():
+        if known[name] == "float" and (not isinstance(one, (int, float)) or isinstance(one, bool)):
+            raise ValueError(f"{name} is {one!r}, must be a number")
+        if known[name] == "str" and not isinstance(one, str):
+            raise ValueError(f"{name} is {one!r}, must be a text")
+    return kind(**table)
 
 
 def _frame(value: Any) -> Frame | None:
     if value is None or isinstance(value, (Enu, Ecef, Local)):
         return value
     table = _table(value)
-    kinds: dict[Any, type[Any]] = {"enu": Enu, "ecef": Ecef, "local": Local}
+    kinds: dict[str, type[Any]] = {"enu": Enu, "ecef": Ecef, "local": Local}
     kind = table.pop("kind", None)
-    if kind not in kinds:
+    if not isinstance(kind, str) or kind not in kinds:
         raise ValueError(f"has kind {kind!r}, must be one of: {', '.join(kinds)}")
     frame: Frame = _build(kinds[kind], table)
     return frame
+
+
+def _endpoints(value: Any) -> tuple[str, ...]:
+    if not (texts := _texts(value)):
+        raise ValueError(f"names no hub: write at least one, as in {DEFAULT_ENDPOINT}")
+    return texts
 
 
 def _maybe(read: Callable[[Any], T]) -> Callable[[Any], T | None]:
@@ -172,6 +194,10 @@ class CentreConfig:
     max_future: float = _setting(2.0, _DURATION, "how far ahead of its reception a message's time may be")
     rule: str = _setting("ci", _rule, "fusion rule (fusion-service rules lists them)")
     rule_options: dict[str, Any] = _setting({}, _table, "options of the rule, e.g. {criterion = 'trace'}")
+    mixture_rule: str = _setting("moments", _mixture_rule, "rule for mixtures; moments: as Gaussians, by the rule")
+    mixture_options: dict[str, Any] = _setting({}, _table, "options of the mixture rule")
+    max_components: int = _setting(8, _whole(1, 100), "components kept of a mixture")
+    publish: str = _setting("mixture", _choice("mixture", "mean", "mode"), "how a track that is a mixture goes out")
     memory: str = _setting("restart", _choice("restart", "recursive"), "fuse local tracks only, or the last result too")
     memory_correlation: float = _setting(
         1.0, _number(0, 1), "bound on the correlation of the last result and new tracks"
@@ -192,7 +218,9 @@ class CentreConfig:
     coast: float = _setting(5.0, _DURATION, "seconds a confirmed track lives on without support")
     stale_periods: float = _setting(3.0, _number(1, 1e6), "a source (or track) is stale after so many periods")
     intensity_rule: str = _setting(
-        "hybrid", _choice("aa", "ga", "hybrid"), "kind = intensity: mean of the intensities; hybrid: number aa, place ga"
+        "hybrid",
+        _choice("aa", "ga", "hybrid"),
+        "kind = intensity: mean of the intensities; hybrid: number aa, place ga",
     )
     intensity_cardinality: str = _setting(
         "average", _choice("average", "consistent"), "hybrid: the number of targets in places with the same sources"
@@ -217,7 +245,7 @@ class BusConfig:
     """Where the bus is."""
 
     realm: str = _setting("fusion", _parsed(check_realm), "first part of every key")
-    connect: tuple[str, ...] = _setting(("tcp/127.0.0.1:7447",), _texts, "endpoints of the hub to join")
+    connect: tuple[str, ...] = _setting((DEFAULT_ENDPOINT,), _endpoints, "endpoints of the hub to join")
     queue: int = _setting(10_000, _whole(10, 10_000_000), "messages held between bus and centre")
 
 
@@ -244,14 +272,16 @@ class ServiceConfig:
 def load_config(path: str | Path) -> ServiceConfig:
     """Read a TOML file. `ConfigError` lists every problem as `file:line: key: what`."""
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        text = Path(path).read_bytes().decode("utf-8-sig").replace("\r\n", "\n")
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError([f"{path}: cannot be read: {error}"]) from None
     try:
         raw = tomllib.loads(text)
-    except tomllib.TOMLDecodeError as error:
+    except RecursionError:
+        raise ConfigError([f"{path}: not TOML: too deep"]) from None
+    except ValueError as error:  # TOMLDecodeError, or a number of too many digits
         raise ConfigError([f"{path}: not TOML: {error}"]) from None
-    problems: list[tuple[tuple[str, ...], str]] = []
+    problems: Problems = []
     known = {one.name: one for one in fields(ServiceConfig)}
     for name in raw:
         if name not in known:
@@ -271,7 +301,7 @@ def centre_config(raw: CentreConfig | Mapping[str, Any]) -> CentreConfig:
     """A `CentreConfig` from a dict of its shape. `ConfigError` lists every problem as `key: what`."""
     if isinstance(raw, CentreConfig):
         return raw
-    problems: list[tuple[tuple[str, ...], str]] = []
+    problems: Problems = []
     config = _read_centre(raw, (), problems)
     if problems:
         raise ConfigError([f"{'.'.join(key)}: {what}" for key, what in problems])
@@ -284,9 +314,7 @@ def config_hash(config: CentreConfig) -> str:
     return hashlib.sha256((plain + str(getattr(config.frame, "kind", ""))).encode()).hexdigest()[:16]
 
 
-def _read(
-    kind: type[T], raw: Any, where: tuple[str, ...], problems: list[tuple[tuple[str, ...], str]], base: Any = None
-) -> T:
+def _read(kind: type[T], raw: Any, where: tuple[str, ...], problems: Problems, base: Any = None) -> T:
     if not isinstance(raw, Mapping):
         problems.append((where, f"is {raw!r}, must be a table"))
         return kind()
@@ -303,7 +331,7 @@ def _read(
     return kind(**values)
 
 
-def _read_centre(raw: Any, where: tuple[str, ...], problems: list[tuple[tuple[str, ...], str]]) -> CentreConfig:
+def _read_centre(raw: Any, where: tuple[str, ...], problems: Problems) -> CentreConfig:
     if not isinstance(raw, Mapping):
         problems.append((where, f"is {raw!r}, must be a table"))
         return CentreConfig()
@@ -329,37 +357,63 @@ def _read_centre(raw: Any, where: tuple[str, ...], problems: list[tuple[tuple[st
         )
     if isinstance(config.frame, Ecef) and "z" not in config.space:
         problems.append(((*where, "frame"), "an ECEF picture needs x, y and z in the space"))
-    if config.rule_options or "rule" in raw:
-        problems.extend(((*where, "rule_options"), what) for what in _rule_option_problems(config))
+    if config.confirm_hits > config.confirm_within:
+        what = (
+            f"is {config.confirm_hits}, more than confirm_within, {config.confirm_within}: nothing would be confirmed"
+        )
+        problems.append(((*where, "confirm_hits"), what))
+    if config.keep_gate < config.gate:
+        what = f"is {config.keep_gate}, less than gate, {config.gate}: a link would break as soon as it is made"
+        problems.append(((*where, "keep_gate"), what))
+    wrong = {key[len(where)] for key, _ in problems if key[: len(where)] == where and len(key) > len(where)}
+    if not wrong & {"rule", "rule_options", "space"}:
+        key = "rule_options" if config.rule_options else "rule"
+        problems.extend(((*where, key), what) for what in _rule_problems(config))
     return dataclasses.replace(config, source_defaults=defaults, sources=sources)
 
 
-def _rule_option_problems(config: CentreConfig) -> list[str]:
-    from fusion_service.rules import RULES
+def _rule_problems(config: CentreConfig) -> list[str]:
+    """Why the centre cannot fuse by this rule and its options: it is tried on one to three unit Gaussians."""
+    from fusion_service.rules import RULES, RuleError, fuse_last
 
     options = RULES[config.rule].options
-    return [
-        f"{config.rule} has no option {name!r} (known: {', '.join(options) or 'none'})"
-        for name in config.rule_options
-        if name not in options
-    ]
+    unknown = [name for name in config.rule_options if name not in options]
+    if unknown:
+        known = ", ".join(options) or "none"
+        return [f"{config.rule} has no option {name!r} (known: {known})" for name in unknown]
+    n = len(config.space)
+    for count in (1, 2, 3):
+        mean, covariance = np.zeros((count, n, 1)), np.tile(np.eye(n)[:, :, None], (count, 1, 1, 1))
+        try:
+            fused = fuse_last(config.rule, mean, covariance, influence=True, **config.rule_options)
+        except (RuleError, TypeError, ValueError) as error:
+            return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} here: {error}"]
+        if not np.isfinite(fused.covariance).all():
+            return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} of unit covariance here"]
+    return []
 
 
-_HEADER = re.compile(r"\s*\[\[?\s*([^\]]+?)\s*\]\]?\s*(#.*)?$")
-_KEY = re.compile(r"\s*([A-Za-z0-9_\-.\"']+)\s*=")
+_PART = r"""(?:"[^"\n]*"|'[^'\n]*'|[A-Za-z0-9_\-]+)"""
+_DOTTED = rf"{_PART}(?:\s*\.\s*{_PART})*"
+_HEADER = re.compile(rf"\s*\[\[?\s*({_DOTTED})\s*\]\]?\s*(#.*)?$")
+_KEY = re.compile(rf"\s*({_DOTTED})\s*=")
 
 
 def _key_lines(text: str) -> dict[tuple[str, ...], int]:
     """Line of every table header and key, for messages (tomllib keeps none)."""
     lines: dict[tuple[str, ...], int] = {}
     table: tuple[str, ...] = ()
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.split("\n"), start=1):
         if header := _HEADER.match(line):
-            table = tuple(part.strip("\"' ") for part in header[1].split("."))
+            table = _parts(header[1])
             lines.setdefault(table, number)
         elif key := _KEY.match(line):
-            lines.setdefault((*table, *(part.strip("\"' ") for part in key[1].split("."))), number)
+            lines.setdefault((*table, *_parts(key[1])), number)
     return lines
+
+
+def _parts(dotted: str) -> tuple[str, ...]:
+    return tuple(part.strip("\"'") for part in re.findall(_PART, dotted))
 
 
 def _line_of(lines: dict[tuple[str, ...], int], key: tuple[str, ...]) -> int:

@@ -321,7 +321,9 @@ class Intake:
                 journal.event({"kind": "frame", "source": source.name})
             messages = [message for (_, message, _), _ in batch]
             try:
-                new = message_tracks(messages, sound, self.frame, self.declared(source).height)
+                new = message_tracks(
+                    messages, sound, self.frame, self.declared(source).height, self.config.max_components
+                )
             except FrameError:
                 reason = "frame"
             else:

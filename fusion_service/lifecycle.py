@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.config import CentreConfig
+from fusion_service.sources import join_tracks, no_parts
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 __all__ = ["Picture", "advance", "empty_picture", "newborn"]
@@ -24,6 +25,7 @@ __all__ = ["Picture", "advance", "empty_picture", "newborn"]
 class Picture:
     """G global tracks sorted by id: mean (n, G), covariance (n, n, G), the rest (G,).
 
+    log_weight (C, G), part_mean (n, C, G), part_covariance (n, n, C, G): components as in `sources.Tracks`.
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; supported i64 of the last step
     with a linked track; hits u64, the last chances as bits; existence.
@@ -33,6 +35,9 @@ class Picture:
     status: NDArray[np.uint8]
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    log_weight: NDArray[np.float64]
+    part_mean: NDArray[np.float64]
+    part_covariance: NDArray[np.float64]
     time: NDArray[np.int64]
     updated: NDArray[np.int64]
     seen: NDArray[np.int64]
@@ -51,9 +56,7 @@ class Picture:
 
     def join(self, other: Picture) -> Picture:
         """Both; ids of `other` are above all of these."""
-        return Picture(
-            *(np.concatenate([getattr(self, one.name), getattr(other, one.name)], axis=-1) for one in fields(self))
-        )
+        return join_tracks([self, other])
 
 
 def empty_picture(n: int) -> Picture:
@@ -64,12 +67,16 @@ def empty_picture(n: int) -> Picture:
 def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
     """Tentative tracks without a density yet."""
     count = len(ids)
+    parts = no_parts(n, count)
     never = np.full(count, -1, dtype=np.int64)
     return Picture(
         id=ids,
         status=np.full(count, TENTATIVE, dtype=np.uint8),
         mean=np.zeros((n, count)),
         covariance=np.zeros((n, n, count)),
+        log_weight=parts[0],
+        part_mean=parts[1],
+        part_covariance=parts[2],
         time=never,
         updated=never,
         seen=never,

@@ -8,16 +8,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.densities import Mixtures
 from fusion_service.intake import Intake
 from fusion_service.journal import Journal
 from fusion_service.motion import predict
-from fusion_service.sources import Tracks
-from schemas import Entry
+from fusion_service.sources import Columns, Tracks, join_tracks, no_parts
+from schemas import Entry, Motion
 
-__all__ = ["NO_TRACK", "Rows", "usable_rows", "write_back"]
+__all__ = ["NO_TRACK", "Rows", "predict_tracks", "usable_rows", "write_back"]
 
 NO_TRACK = np.uint64(0)
 """The link of a track that belongs to no global track."""
+PARTS = ("log_weight", "part_mean", "part_covariance")
 LINK_COLUMNS = ("link", "since", "fails", "used")
 
 
@@ -56,25 +58,46 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         source.tracks = table = source.tracks.take(source.tracks.time >= oldest)
         if source.muted or not intake.ready(source):
             continue
-        dt = (time - table.time) / 1e9
-        mean, covariance = predict(said.motion, source.space, table.mean, table.covariance, dt)
-        at = [source.space.index(component) for component in config.space]
-        mean, covariance = mean[at], covariance[np.ix_(at, at)]
-        sound = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
+        predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9)
+        sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
             journal.refuse(Entry(name, source.epoch, 0, 0, "ill-conditioned", len(sound) - count))
             source.tracks = table.take(sound)
         kept[name] = count
-        parts.append(replace(table, mean=mean, covariance=covariance).take(sound))
+        parts.append(predicted.take(sound))
         index.append(np.full(count, number, dtype=np.intp))
         epochs.append(np.full(count, source.epoch, dtype=np.uint64))
         starts.append(np.full(count, said.may_start, dtype=np.bool_))
     if not parts:
         nothing = intake.nothing()
         return Rows(np.zeros(0, dtype=np.intp), nothing.id, nothing, np.zeros(0, dtype=np.bool_), kept)
-    columns = (np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in Tracks.__slots__)
-    return Rows(np.concatenate(index), np.concatenate(epochs), Tracks(*columns), np.concatenate(starts), kept)
+    return Rows(np.concatenate(index), np.concatenate(epochs), join_tracks(parts), np.concatenate(starts), kept)
+
+
+def predict_tracks(
+    tracks: Columns, motion: Motion, space: tuple[str, ...], wanted: tuple[str, ...], dt: NDArray[np.float64]
+) -> Columns:
+    """Densities `dt` (T,) seconds later, marginalised from `space` to the components `wanted`."""
+    at = [space.index(component) for component in wanted]
+    some = np.ix_(at, at)
+    components = len(tracks.log_weight)
+    if not components:
+        mean, covariance = predict(motion, space, tracks.mean, tracks.covariance, dt)
+        parts = no_parts(len(at), len(dt))
+        return replace(tracks, mean=mean[at], covariance=covariance[some], **dict(zip(PARTS, parts, strict=True)))
+    n, count = tracks.mean.shape
+    means, covariances = predict(
+        motion,
+        space,
+        tracks.part_mean.reshape(n, -1),
+        tracks.part_covariance.reshape(n, n, -1),
+        np.tile(dt, components),
+    )
+    means = means.reshape(n, components, count)[at]
+    covariances = covariances.reshape(n, n, components, count)[some]
+    mean, covariance = Mixtures(tracks.log_weight, means, covariances).moments()
+    return replace(tracks, mean=mean, covariance=covariance, part_mean=means, part_covariance=covariances)
 
 
 def write_back(rows: Rows, intake: Intake) -> None:

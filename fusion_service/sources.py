@@ -10,26 +10,59 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any
+from typing import Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, linalg
-from fusion_service.densities import moments
+from fusion_service.densities import Mixtures, reduce_mixtures
 from schemas import Frame, Height, LocalTracks, SensorInfo
 
-__all__ = ["REMEMBERED", "Source", "Tracks", "empty_tracks", "message_tracks", "newest"]
+__all__ = [
+    "REMEMBERED",
+    "Columns",
+    "Source",
+    "Tracks",
+    "empty_tracks",
+    "join_tracks",
+    "message_tracks",
+    "newest",
+    "no_parts",
+    "padded",
+]
+
+Floats = NDArray[np.float64]
+Columns = TypeVar("Columns", bound="HasParts")
 
 REMEMBERED = 1024
 MOST_GAPS = 2**62
 """Messages of one source whose exact repeat is recognised; older ones are too late to matter."""
 
 
+class HasParts(Protocol):
+    """Columns of densities that may be mixtures: `Tracks`, or the global tracks."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def mean(self) -> Floats: ...
+    @property
+    def covariance(self) -> Floats: ...
+    @property
+    def log_weight(self) -> Floats: ...
+    @property
+    def part_mean(self) -> Floats: ...
+    @property
+    def part_covariance(self) -> Floats: ...
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
     """T tracks of one source: mean (n, T), covariance (n, n, T), the rest (T,).
 
+    Where some track is a mixture, parts (C > 0) hold its components, log_weight (C, T) with -inf for padding,
+    part_mean (n, C, T), part_covariance (n, n, C, T), and mean and covariance are their moments; else C = 0.
     id u64; time i64 of the density; updated i64 of the last measurement; existence (NaN: not reported);
     link u64 global id or 0; since i64 step of the link; fails i64 steps in a row that the link has failed;
     used i64 time of the version last fused (-1: none).
@@ -39,6 +72,9 @@ class Tracks:
     time: NDArray[np.int64]
     mean: NDArray[np.float64]
     covariance: NDArray[np.float64]
+    log_weight: NDArray[np.float64]
+    part_mean: NDArray[np.float64]
+    part_covariance: NDArray[np.float64]
     existence: NDArray[np.float64]
     updated: NDArray[np.int64]
     link: NDArray[np.uint64]
@@ -50,6 +86,13 @@ class Tracks:
         """The given rows (indices or a mask)."""
         return Tracks(*(getattr(self, one.name)[..., rows] for one in fields(self)))
 
+    def mixtures(self, rows: Any) -> Mixtures:
+        """The densities of the given rows as mixtures."""
+        if not len(self.log_weight):
+            mean, covariance = self.mean[:, None, rows], self.covariance[:, :, None, rows]
+            return Mixtures(np.zeros_like(mean[0]), mean, covariance)
+        return Mixtures(self.log_weight[:, rows], self.part_mean[..., rows], self.part_covariance[..., rows])
+
 
 LINKS = ("link", "since", "fails", "used")
 
@@ -58,22 +101,64 @@ def empty_tracks(n: int) -> Tracks:
     """No tracks, of n components."""
     whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
     ids = np.zeros(0, dtype=np.uint64)
-    return Tracks(ids, whole, np.zeros((n, 0)), np.zeros((n, n, 0)), real, whole, ids, whole, whole, whole)
+    moments, parts = (np.zeros((n, 0)), np.zeros((n, n, 0))), no_parts(n, 0)
+    return Tracks(ids, whole, *moments, *parts, real, whole, ids, whole, whole, whole)
+
+
+def no_parts(n: int, count: int) -> tuple[Floats, Floats, Floats]:
+    """The columns of components of `count` tracks that are all Gaussian."""
+    return np.zeros((0, count)), np.zeros((n, 0, count)), np.zeros((n, n, 0, count))
+
+
+def join_tracks(parts: Sequence[Columns]) -> Columns:
+    """One after the other; where some hold components, all get them."""
+    most = max(len(part.log_weight) for part in parts)
+    if any(len(part.log_weight) != most for part in parts):
+        parts = [padded(part, most) for part in parts]
+    first = parts[0]
+    names = [one.name for one in fields(first)]
+    return type(first)(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names))
+
+
+def padded(tracks: Columns, components: int) -> Columns:
+    """The same with room for so many components."""
+    had = len(tracks.log_weight)
+    if had == components:
+        return tracks
+    log_weight = np.full((components, tracks.mean.shape[-1]), -np.inf)
+    if had:
+        index = np.minimum(np.arange(components), had - 1)
+        log_weight[:had] = tracks.log_weight
+        mean, covariance = tracks.part_mean[:, index], tracks.part_covariance[:, :, index]
+    else:
+        log_weight[0] = 0.0
+        mean = np.repeat(tracks.mean[:, None], components, axis=1)
+        covariance = np.repeat(tracks.covariance[:, :, None], components, axis=2)
+    return replace(tracks, log_weight=log_weight, part_mean=mean, part_covariance=covariance)
 
 
 def message_tracks(
-    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], frame: Frame, height: Height | None
+    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], frame: Frame, height: Height | None, most: int
 ) -> Tracks:
-    """The sound tracks of messages of one space, frame and height, in `frame`, one after the other; mixtures as
-    their mean and covariance.
+    """The sound tracks of messages of one space, frame and height, in `frame`, one after the other; mixtures of
+    more than `most` components are reduced.
 
     Raises `geodesy.FrameError` where their frame cannot be brought into `frame`.
     """
     first = messages[0]
-    parts = [moments(m.means, m.covariances, m.weights, m.counts) for m in messages]
-    means = np.concatenate([mean[rows] for (mean, _), rows in zip(parts, sound, strict=True)])
-    covariances = np.concatenate([spread[rows] for (_, spread), rows in zip(parts, sound, strict=True)])
+    means, covariances, weights, sizes = (
+        np.concatenate(column) for column in zip(*map(_components, messages, sound), strict=True)
+    )
     means, covariances = geodesy.transform(means, covariances, first.space, first.frame, frame, first.height or height)
+    if sizes.max(initial=1) == 1:
+        mean, covariance = linalg.to_last(means, 1), linalg.symmetrise(linalg.to_last(covariances, 2))
+        parts = no_parts(len(mean), len(sizes))
+    else:
+        mixtures = Mixtures.from_rows(weights, means, covariances, sizes).normalised()
+        if len(mixtures.log_weights) > most:
+            mixtures = reduce_mixtures(mixtures, max_components=most)
+        mean, covariance = mixtures.moments()
+        parts = mixtures.log_weights, mixtures.means, linalg.symmetrise(mixtures.covariances)
     counts = [int(rows.sum()) for rows in sound]
     times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
     updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
@@ -82,8 +167,11 @@ def message_tracks(
     return Tracks(
         id=_gather([m.ids for m in messages], sound).astype(np.uint64),
         time=times,
-        mean=linalg.to_last(means, 1),
-        covariance=linalg.symmetrise(linalg.to_last(covariances, 2)),
+        mean=mean,
+        covariance=linalg.symmetrise(covariance),
+        log_weight=parts[0],
+        part_mean=parts[1],
+        part_covariance=parts[2],
         existence=_gather(existence, sound).astype(np.float64),
         updated=np.minimum(_gather(updated, sound), times),
         link=np.zeros(len(times), dtype=np.uint64),
@@ -91,6 +179,16 @@ def message_tracks(
         fails=np.zeros(len(times), dtype=np.int64),
         used=none,
     )
+
+
+def _components(message: LocalTracks, sound: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, NDArray[np.intp]]:
+    """Means, covariances and weights of the components of the sound tracks, and how many each of these has."""
+    if message.counts is None or message.weights is None:
+        count = int(sound.sum())
+        return message.means[sound], message.covariances[sound], np.ones(count), np.ones(count, dtype=np.intp)
+    counts = message.counts.astype(np.intp)
+    rows = np.repeat(sound, counts)
+    return message.means[rows], message.covariances[rows], message.weights[rows], counts[sound]
 
 
 def _gather(columns: Sequence[NDArray[Any]], rows: Sequence[NDArray[np.bool_]]) -> NDArray[Any]:
@@ -107,7 +205,7 @@ def newest(old: Tracks, new: Tracks) -> Tracks:
         known = old.id[at] == new.id
         kept = {name: np.where(known, getattr(old, name)[at], getattr(new, name)) for name in LINKS}
         new = replace(new, **kept)
-    both = Tracks(*(np.concatenate([getattr(old, one.name), getattr(new, one.name)], axis=-1) for one in fields(old)))
+    both = join_tracks([old, new])
     order = np.lexsort((np.arange(len(both.id)), both.time, both.id))
     last = np.append(both.id[order][1:] != both.id[order][:-1], True) if len(order) else np.zeros(0, dtype=np.bool_)
     return both.take(order[last])

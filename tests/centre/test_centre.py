@@ -124,8 +124,8 @@ def test_sources_with_their_own_frames_meet() -> None:
     np.testing.assert_allclose(picture.means[0, :2], expected, atol=0.01)
 
 
-def test_a_mixture_enters_as_its_mean_and_covariance() -> None:
-    made = FusionCentre({})
+def test_a_mixture_goes_out_as_its_mean_and_covariance_where_asked() -> None:
+    made = FusionCentre({"publish": "mean"})
     parts = np.array([[-10.0, 0, 0, 0], [30.0, 0, 0, 0]])
     message = dataclasses.replace(
         tracks("r1", 1, parts),
