@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from .. import linalg
 from ..linalg import FloatArray, inner, total
-from . import pairs, simplex
+from . import line, pairs, simplex
 from .sources import Result, Sources, condition, weighted_mean, weighted_sum
 
 
@@ -46,30 +46,32 @@ def hmd_ga(sources: Sources, weights: FloatArray | None, influence: bool, *, cri
             sources.condition,
             zero,
         )
+    if len(sources.means) == 1:
+        criterion = "det"  # the same, and kinder to rounding
     mixture, log_z, worst = _others(sources)
     if not constants:
         log_z = np.zeros_like(log_z)
     if weights is not None:
         v = _normalised(np.log(weights) + log_z)
-    elif sources.count == 2 and sources.fast and len(sources.means) <= pairs.LIMIT:
+    elif sources.count == 2:
         P, A, dets = sources.covariances, sources.information, sources.dets
-        ends = (P[:, :, 0], P[:, :, 1]), (A[:, :, 0], A[:, :, 1]), (dets[0], dets[1])
-        t = pairs.best_weight(criterion, *ends, bump=sources.spread[:, 1])
+        pair, bump = (P[:, :, 0], P[:, :, 1]), sources.spread[:, 1]
+        if sources.fast and len(sources.means) <= pairs.LIMIT:
+            t = pairs.best_weight(criterion, pair, (A[:, :, 0], A[:, :, 1]), (dets[0], dets[1]), bump=bump)
+        else:
+            t = line.best_weight(criterion, pair, bump=bump)
         v = np.stack([t, 1.0 - t])
     else:
         v = simplex.best_weights(criterion, mixture, sources.uniform)
-    G, D = mixture(v)
-    V = linalg.inverse(G)
+    V, spoilt, g = (_mutual_of_two if sources.count == 2 else _mutual)(mixture, v, criterion)
     A = sources.information
     everything = weighted_sum(A)
     M = everything - V
     P = linalg.inverse(M)
     y = weighted_mean(sources) - linalg.matvec(V, mixture.mean(v))
     # M is a difference: what is lost in it is tr(P sum P_i^-1) / n >= 1
-    worst = np.maximum(worst, condition(G, V)) * inner(P, everything) / len(P)
-    gap = np.zeros_like(worst)
-    if weights is None:
-        gap = simplex.gap(v, simplex.gradient(criterion, V, D))
+    worst = np.maximum(worst, spoilt) * inner(P, everything) / len(P)
+    gap = simplex.gap(v, g) if weights is None else np.zeros_like(worst)
     return Result(
         sources.means[:, 0] + linalg.matvec(P, y),
         P,
@@ -102,6 +104,25 @@ class Mixture:
 
     def take(self, index: NDArray[np.bool_]) -> Self:
         return replace(self, C=self.C[..., index], c=self.c[..., index])
+
+
+def _mutual(mixture: Mixture, v: FloatArray, criterion: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """G^-1 (n, n, B), the condition of what was inverted, and the gradient (N, B) of the criterion."""
+    G, D = mixture(v)
+    V = linalg.inverse(G)
+    return V, condition(G, V), simplex.gradient(criterion, V, D)
+
+
+def _mutual_of_two(mixture: Mixture, v: FloatArray, criterion: str) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """The same by Sherman and Morrison: means many sigmas apart make G ill-conditioned, and do no harm here."""
+    C, d = mixture.C, mixture.c[:, 0] - mixture.c[:, 1]
+    L = weighted_sum(C, v)
+    U = linalg.inverse(L)
+    V, e = line.spread_inverse(U, d, v[0] * v[1])
+    if criterion == "det" or len(V) == 1:
+        return V, condition(L, U), -inner(V[:, :, None], C) - v[::-1] ** 2 * total(e * d)
+    W, scale = linalg.product(V, V), linalg.trace(V)
+    return V, condition(L, U), -(inner(W[:, :, None], C) + v[::-1] ** 2 * total(e * e)) / scale
 
 
 def _others(sources: Sources) -> tuple[Mixture, FloatArray, FloatArray]:

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from .. import linalg
 from ..linalg import FloatArray, inner
-from . import pairs, simplex
+from . import line, pairs, simplex
 from .sources import Result, Sources, weighted_product, weighted_sum
 
 
@@ -55,10 +55,13 @@ def _intersection(sources: Sources, weights: FloatArray | None, influence: bool,
     model = Inflated(sources.information, rho)
     optimise = weights is None and rho > 0.0 and sources.count > 1
     w = sources.uniform if weights is None else weights
-    if optimise and sources.count == 2 and sources.fast and len(sources.means) <= pairs.LIMIT:
+    if optimise and sources.count == 2:
         A, P, dets = model.A, sources.covariances, 1.0 / sources.dets
-        ends = (A[:, :, 1], A[:, :, 0]), (P[:, :, 1], P[:, :, 0]), (dets[1], dets[0])
-        t = pairs.best_weight(criterion, *ends, rho=rho)
+        M = A[:, :, 1], A[:, :, 0]
+        if sources.fast and len(sources.means) <= pairs.LIMIT:
+            t = pairs.best_weight(criterion, M, (P[:, :, 1], P[:, :, 0]), (dets[1], dets[0]), rho=rho)
+        else:
+            t = line.best_weight(criterion, M, rho=rho)
         w = np.stack([t, 1.0 - t])
     elif optimise:
         w = simplex.best_weights(criterion, model, w)

@@ -2,7 +2,7 @@
 
 Along one weight t, det M(t) and trace adj M(t) are polynomials of degree n (one more with a spread term).
 Their values at both ends, what the inverses there tell of their slopes, and values at a few nodes between
-give them. Meant for n <= `LIMIT`: beyond, interpolation loses too many digits, and `simplex` does the work.
+give them. Meant for n <= `LIMIT`: beyond, interpolation loses too many digits, and `line` does the work.
 
 For det and a plain sum, det M = sum e_k t^k (1-t)^(n-k) with all e_k >= 0, and with u = t / (1-t) the best t
 is where q(u) = sum ((k+1) e_(k+1) - (n-k) e_k) u^k = 0, k < n. det M(u) has only real roots, so q has too
@@ -99,7 +99,8 @@ def _form(A: FloatArray, x: FloatArray) -> FloatArray:
 @cache
 def _nodes(count: int) -> FloatArray:
     """The inner Chebyshev-Lobatto nodes of [0, 1]."""
-    return 0.5 - 0.5 * np.cos(np.pi * np.arange(1, count + 1) / (count + 1))
+    out: FloatArray = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, count + 1) / (count + 1))
+    return out
 
 
 @cache

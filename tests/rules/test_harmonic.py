@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import null_space
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 from strategies import sources
@@ -132,6 +133,23 @@ def test_weights_of_many_sources_solve_77(criterion: str, constants: bool) -> No
         assert cost(criterion, np.linalg.inv(V)) <= want + 1e-7
         again = fuse("hmd-ga", x, P, weights=fused.weights, constants=constants)
         np.testing.assert_allclose(again.covariance, fused.covariance, rtol=1e-7, atol=1e-10)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+@pytest.mark.parametrize("n", [2, 4, 7])
+def test_means_any_number_of_sigmas_apart(n: int, criterion: str) -> None:
+    """Along their difference d nothing is mutual: G^-1 tends to N (N' L N)^-1 N', N the null space of d'."""
+    rng = np.random.default_rng(SEED)
+    for far in (1e6, 1e9, 1e12):
+        x, P = sources(rng, 2, n)
+        x[1] += far * rng.normal(size=n)
+        fused = fuse("hmd-ga", x, P, criterion=criterion, weights=[0.3, 0.7])
+        N = null_space((x[1] - x[0])[None])
+        V = N @ np.linalg.inv(N.T @ (0.7 * P[0] + 0.3 * P[1]) @ N) @ N.T
+        want = np.linalg.inv(np.linalg.inv(P).sum(axis=0) - V)
+        np.testing.assert_allclose(fused.covariance, want, rtol=1e-6, atol=1e-6 * np.trace(want))
+        w = fuse("hmd-ga", x, P, criterion=criterion).weights
+        assert 0.0 < w.min()
 
 
 def test_scalars_have_the_closed_form_of_section_6_1() -> None:
