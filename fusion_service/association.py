@@ -17,13 +17,16 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service import linalg
+from fusion_service.densities import Mixtures, log_sum
 
-__all__ = ["by_size", "candidate_pairs", "cluster", "leave_one_out", "pair_distance", "uniform_ci"]
+__all__ = ["by_size", "candidate_pairs", "cluster", "leave_one_out", "overlap", "pair_distance", "uniform_ci"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Label = TypeVar("Label", bound=np.generic)
 
+LIGHTEST = 0.05
+"""Components of less weight do not open a gate."""
 TIERS = (8, 64)
 """Neighbours sought of a row, and again of one that has as many; one that has the last number is crowded."""
 CROWD = 256
@@ -93,6 +96,25 @@ def pair_distance(means: Floats, covariances: Floats, i: Ints, j: Ints) -> tuple
         distance[part] = linalg.quadratic(both, means[:, a] - means[:, b])
         spread[part] = linalg.logdet(both)
     return distance, spread
+
+
+def overlap(first: Mixtures, second: Mixtures) -> tuple[Floats, Floats]:
+    """How near K pairs of mixtures are: d2 (K,) of their nearest components of weight `LIGHTEST` or more, and
+    -2 log of the overlap integral (without the 2 pi), less that d2: for Gaussians d2 and log det(Pi + Pj)."""
+    nearest = np.full(len(first), np.inf)
+    n = len(first.means)
+    logs = []
+    for a in range(len(first.log_weights)):
+        for b in range(len(second.log_weights)):
+            total = first.covariances[:, :, a] + second.covariances[:, :, b]
+            distance = linalg.quadratic(total, first.means[:, a] - second.means[:, b])
+            weight = first.log_weights[a] + second.log_weights[b]
+            logs.append(weight - 0.5 * (distance + linalg.logdet(total)))
+            heavy = np.minimum(first.log_weights[a], second.log_weights[b]) >= np.log(LIGHTEST)
+            nearest = np.where(heavy, np.fmin(nearest, distance), nearest)
+    if not logs or not n:
+        return nearest, nearest
+    return nearest, -2.0 * log_sum(np.stack(logs)) - nearest
 
 
 def candidate_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints) -> tuple[Ints, Ints]:

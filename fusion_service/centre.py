@@ -165,9 +165,7 @@ class FusionCentre:
         linker, journal = self._linker, self._journal
         linker.check(rows, journal)
         now = self._predicted(time)
-        self._picture, agreements = linker.link(
-            rows, self._picture, now.mean, now.covariance, self._step, time, journal
-        )
+        self._picture, agreements = linker.link(rows, self._picture, now, self._step, time, journal)
         merged = linker.merge(rows, agreements, self._step, journal)
         self._relink(merged)
         if merged:

@@ -2,7 +2,8 @@
 
 Gaussian tracks go by `rule`. Where a track is a mixture, a target that one source sees keeps it; what several see
 is fused by `mixture_rule` ("moments": by `rule` on means and covariances, and the result is Gaussian), reduced to
-`max_components`. With recursive memory the predicted last result joins as one more source under
+`max_components`. Without options of its own, the arithmetic average ("aa") weighs
+every source by the existence it reports. With recursive memory the predicted last result joins as one more source under
 `memory_correlation`, by its moments, and each version of a local track is used once.
 """
 
@@ -68,7 +69,8 @@ def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, jour
 def _gaussian(rows: Rows, members: Ints, config: CentreConfig, journal: Journal) -> tuple[Floats, Floats, Floats]:
     means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
     covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
-    fused = fuse_last(config.rule, means, covariances, influence=True, **config.rule_options)
+    weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
+    fused = fuse_last(config.rule, means, covariances, weights, influence=True, **config.rule_options)
     one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
     bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
     if bad.any():
@@ -92,11 +94,22 @@ def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtu
     if alone:
         return sources[0], several
     options = {**config.mixture_options, "max_components": config.max_components}
-    parts, _ = fuse_mixtures_last(config.mixture_rule, sources, **options)
+    by_existence = config.mixture_rule == "aa" and not config.mixture_options
+    weights = _shares(rows, members[several]) if by_existence else None
+    parts, _ = fuse_mixtures_last(config.mixture_rule, sources, weights, **options)
     mean, covariance = parts.moments()
     sound = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
     several[np.flatnonzero(several)[~sound]] = False
     return parts.take(sound), several
+
+
+def _shares(rows: Rows, members: Ints) -> Floats:
+    """Weights (k, B) of an arithmetic average: each source counts as it believes in the target."""
+    r = np.nan_to_num(rows.tracks.existence[members].T, nan=1.0)
+    total = r[0]
+    for one in r[1:]:
+        total = total + one
+    return np.where(total > 0, r / np.where(total > 0, total, 1.0), 1.0 / len(r))
 
 
 def _remember(

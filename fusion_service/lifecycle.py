@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.config import CentreConfig
-from fusion_service.sources import join_tracks, no_parts
+from fusion_service.densities import Mixtures
+from fusion_service.sources import as_mixtures, join_tracks, no_parts
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 __all__ = ["Picture", "advance", "empty_picture", "newborn"]
@@ -49,6 +50,10 @@ class Picture:
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
         return Picture(*(getattr(self, one.name)[..., rows] for one in fields(self)))
+
+    def mixtures(self, rows: Any) -> Mixtures:
+        """The densities of the given rows as mixtures."""
+        return as_mixtures(self, rows)
 
     def find(self, ids: NDArray[np.uint64]) -> NDArray[np.intp]:
         """Rows of ids that are in the picture."""

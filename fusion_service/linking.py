@@ -8,8 +8,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion_service.association import by_size, candidate_pairs, cluster, leave_one_out, pair_distance, uniform_ci
+from fusion_service.association import (
+    by_size,
+    candidate_pairs,
+    cluster,
+    leave_one_out,
+    overlap,
+    pair_distance,
+    uniform_ci,
+)
 from fusion_service.config import CentreConfig
+from fusion_service.densities import Mixtures
 from fusion_service.journal import Journal
 from fusion_service.lifecycle import Picture, newborn
 from fusion_service.rows import NO_TRACK, Rows
@@ -65,15 +74,15 @@ class Linker:
         journal.decide(words.KEPT, rows, linked[stays], links[stays], distance[stays])
 
     def link(
-        self, rows: Rows, picture: Picture, mean: Floats, covariance: Floats, step: int, time: int, journal: Journal
+        self, rows: Rows, picture: Picture, now: Picture, step: int, time: int, journal: Journal
     ) -> tuple[Picture, list[Agreement]]:
         """Link free tracks to global tracks or to each other, and start new ones.
 
-        mean (n, G), covariance (n, n, G): the picture predicted to `time`; where local tracks stand in a
-        global track their fusion takes its place. Returns the picture with its new tracks, and the pairs of
-        global tracks that agree and share no source.
+        now: the picture predicted to `time`; where local tracks stand in a global track their fusion takes its
+        place. Returns the picture with its new tracks, and the pairs of global tracks that agree and share no
+        source.
         """
-        mean, covariance, masks, bits = self._nodes(rows, picture, mean, covariance)
+        mean, covariance, masks, bits = self._nodes(rows, picture, now.mean, now.covariance)
         free = np.flatnonzero(rows.tracks.link == NO_TRACK)
         known = np.flatnonzero(picture.time >= 0)
         count = len(known)
@@ -81,7 +90,8 @@ class Linker:
         covariance = np.concatenate([covariance[:, :, known], rows.tracks.covariance[:, :, free]], axis=2)
         masks = np.concatenate([masks[known], bits[free]])
         source = np.concatenate([np.full(count, -1), rows.source[free]])
-        i, j, distance, spread = self._gated(mean, covariance, masks, source)
+        parts = _components(now, known, rows, free)
+        i, j, distance, spread = self._gated(mean, covariance, masks, source, parts)
         both = j < count
         agreements = [
             (int(picture.id[known[a]]), int(picture.id[known[b]]), float(d))
@@ -115,14 +125,19 @@ class Linker:
         return mean, covariance, masks, bits
 
     def _gated(
-        self, mean: Floats, covariance: Floats, masks: NDArray[Any], source: Ints
+        self, mean: Floats, covariance: Floats, masks: NDArray[Any], source: Ints, parts: Mixtures | None
     ) -> tuple[Ints, Ints, Floats, Floats]:
-        """Pairs i < j within the gate that share no source, in order, with d2 and log det."""
+        """Pairs i < j within the gate that share no source, in order, with d2 and log det; of mixtures, the d2
+        of their nearest components and what d2 + log det would be for their overlap, less that d2."""
         sigma = np.sqrt(sum(covariance[place, place] for place in self._places))
         i, j = candidate_pairs(mean[self._places], sigma, float(np.sqrt(self._gate)), source)
         disjoint = (masks[i] & masks[j]) == 0
         i, j = i[disjoint], j[disjoint]
         distance, spread = pair_distance(mean, covariance, i, j)
+        if parts is not None:
+            several = np.isfinite(parts.log_weights).sum(axis=0) > 1
+            at = np.flatnonzero(several[i] | several[j])
+            distance[at], spread[at] = overlap(parts.take(i[at]), parts.take(j[at]))
         near = distance <= self._gate
         return i[near], j[near], distance[near], spread[near]
 
@@ -182,6 +197,13 @@ class Linker:
                 rows.tracks.since[moved] = step
         self.agreeing = {pair: count for pair, count in self.agreeing.items() if not taken & set(pair)}
         return merged
+
+
+def _components(now: Picture, known: Ints, rows: Rows, free: Ints) -> Mixtures | None:
+    """The densities of the global tracks and the free rows as mixtures, where any of them is one."""
+    if not len(now.log_weight) and not len(rows.tracks.log_weight):
+        return None
+    return Mixtures.joined([now.mixtures(known), rows.tracks.mixtures(free)])
 
 
 def _bits(source: Ints) -> NDArray[Any]:

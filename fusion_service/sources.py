@@ -24,6 +24,7 @@ __all__ = [
     "Columns",
     "Source",
     "Tracks",
+    "as_mixtures",
     "empty_tracks",
     "join_tracks",
     "message_tracks",
@@ -88,10 +89,7 @@ class Tracks:
 
     def mixtures(self, rows: Any) -> Mixtures:
         """The densities of the given rows as mixtures."""
-        if not len(self.log_weight):
-            mean, covariance = self.mean[:, None, rows], self.covariance[:, :, None, rows]
-            return Mixtures(np.zeros_like(mean[0]), mean, covariance)
-        return Mixtures(self.log_weight[:, rows], self.part_mean[..., rows], self.part_covariance[..., rows])
+        return as_mixtures(self, rows)
 
 
 LINKS = ("link", "since", "fails", "used")
@@ -118,6 +116,14 @@ def join_tracks(parts: Sequence[Columns]) -> Columns:
     first = parts[0]
     names = [one.name for one in fields(first)]
     return type(first)(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names))
+
+
+def as_mixtures(tracks: HasParts, rows: Any) -> Mixtures:
+    """The densities of the given rows as mixtures."""
+    if not len(tracks.log_weight):
+        mean, covariance = tracks.mean[:, None, rows], tracks.covariance[:, :, None, rows]
+        return Mixtures(np.zeros_like(mean[0]), mean, covariance)
+    return Mixtures(tracks.log_weight[:, rows], tracks.part_mean[..., rows], tracks.part_covariance[..., rows])
 
 
 def padded(tracks: Columns, components: int) -> Columns:

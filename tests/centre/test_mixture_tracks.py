@@ -131,6 +131,39 @@ def test_a_space_with_more_components_is_marginalised_mode_by_mode() -> None:
     same_density(published(step(made, 1).tracks), mixture)
 
 
+def test_modes_meet_where_means_would_not() -> None:
+    """A bearing-only source sees one of two ranges; a sharp track stands at the farther one."""
+    spread = np.diag([25.0, 25.0, 1.0, 1.0])
+    modes = Mixture([0.5, 0.5], [[-500.0, 0, 0, 0], [500.0, 0, 0, 0]], [spread, spread])
+    between = np.zeros((1, 4))
+    for at, meets in (([500.0, 0, 0, 0], True), (between[0], False)):
+        made = centre(SOURCES, mixture_rule="aa")
+        give(made, mixed("r1", 1, [modes]), tracks("r2", 1, [at], sigma=np.array([5.0, 5.0, 1.0, 1.0])))
+        assert int(step(made, 1).tracks.contributor_counts.max()) == (2 if meets else 1)
+
+
+def test_overlap_is_the_integral_of_the_product() -> None:
+    from fusion_service.association import overlap
+    from fusion_service.densities import Mixtures
+
+    [one], [other] = some(1, 3, 11), some(1, 2, 12)
+    distance, rest = overlap(Mixtures.of([one]), Mixtures.of([other]))
+    points = one.draw(200_000, seed=5)
+    values = np.exp(other.log_pdf(points))
+    expected = -2 * (np.log(values.mean()) + 2 * np.log(2 * np.pi))
+    error = 2 * values.std() / np.sqrt(len(values)) / values.mean()
+    assert float((distance + rest)[0]) == pytest.approx(expected, abs=4 * error)
+
+
+def test_an_average_weighs_each_source_by_the_existence_it_reports() -> None:
+    mixtures = [some(1, 2, 1)[0], some(1, 3, 2)[0]]
+    made = centre(SOURCES, mixture_rule="aa", max_components=20)
+    for name, mixture, r in zip(SOURCES, mixtures, (0.9, 0.3), strict=True):
+        give(made, mixed(name, 1, [mixture], existence=np.array([r])))
+    expected = fuse_mixtures("aa", mixtures, weights=[0.75, 0.25], max_components=20)
+    same_density(published(step(made, 1).tracks), expected)
+
+
 def run(shuffle: int | None, cut: int | None, **config: Any) -> list[bytes]:
     made = FusionCentre({"max_components": 6, "lateness": 3.0, **config})
     states = truth(6)
