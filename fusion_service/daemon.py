@@ -25,6 +25,7 @@ from fusion_service.checkpoint import CheckpointError
 from fusion_service.clock import MessageClock, WallClock
 from fusion_service.config import ServiceConfig
 from fusion_service.inbox import Inbox
+from fusion_service.intensity import IntensityCentre
 from fusion_service.state import State, StateError, open_state
 from schemas import (
     LocalIntensity,
@@ -89,15 +90,16 @@ class Service:
         self._told: dict[str, float] = {}
         self._started = time.monotonic()
 
-    def _make_centre(self, generation: int) -> FusionCentre:
+    def _make_centre(self, generation: int) -> FusionCentre | IntensityCentre:
+        kind = IntensityCentre if self._config.centre.kind == "intensity" else FusionCentre
         self._epoch = time.time_ns()
         try:
-            return FusionCentre(self._config.centre, self._blob, generation=generation, epoch=self._epoch)
+            return kind(self._config.centre, self._blob, generation=generation, epoch=self._epoch)
         except CheckpointError as error:
             log.warning("starting without the checkpoint: %s", error)
             self._state.set_aside()
             self._blob = None
-            return FusionCentre(self._config.centre, generation=generation, epoch=self._epoch)
+            return kind(self._config.centre, generation=generation, epoch=self._epoch)
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set."""
@@ -114,7 +116,9 @@ class Service:
         bus.announce(global_key(name, "alive", realm))
         threading.Thread(target=self._wake_at, args=(stop,), daemon=True).start()
         _notify("READY=1")
-        log.info("fusing by %s every %g s as %s", self._config.centre.rule, self._config.centre.period, name)
+        centre = self._config.centre
+        rule = centre.rule if centre.kind == "tracks" else f"{centre.intensity_rule} of intensities"
+        log.info("fusing by %s every %g s as %s", rule, centre.period, name)
         status_due = time.monotonic() + self._config.service.status_period
         while not stop.is_set():
             timeout = max(0.0, status_due - time.monotonic())
