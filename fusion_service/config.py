@@ -10,7 +10,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
@@ -19,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from fusion_service.toml_text import dotted, key_lines, line_of, toml_value
 from schemas import Ecef, Enu, Frame, Height, Local, Motion, check_name, check_realm, check_space
 
 __all__ = [
@@ -132,8 +132,10 @@ def _build(kind: type[T], value: Any) -> T:
     if not needed <= set(table) <= set(known):
         raise ValueError(f"has the keys {', '.join(table) or 'none'}, wants: {', '.join(known)}")
     for name, one in table.items():
-        if known[name] == "float" and (not isinstance(one, (int, float)) or isinstance(one, bool)):
-            raise ValueError(f"{name} is {one!r}, must be a number")
+        if known[name] == "float":
+            if not isinstance(one, (int, float)) or isinstance(one, bool):
+                raise ValueError(f"{name} is {one!r}, must be a number")
+            table[name] = float(one)
         if known[name] == "str" and not isinstance(one, str):
             raise ValueError(f"{name} is {one!r}, must be a text")
     return kind(**table)
@@ -292,8 +294,8 @@ def load_config(path: str | Path) -> ServiceConfig:
         service=_read(DaemonConfig, raw.get("service", {}), ("service",), problems),
     )
     if problems:
-        lines = _key_lines(text)
-        raise ConfigError([f"{path}:{_line_of(lines, key)}: {'.'.join(key)}: {what}" for key, what in problems])
+        lines = key_lines(text)
+        raise ConfigError([f"{path}:{line_of(lines, key)}: {dotted(key)}: {what}" for key, what in problems])
     return config
 
 
@@ -304,14 +306,18 @@ def centre_config(raw: CentreConfig | Mapping[str, Any]) -> CentreConfig:
     problems: Problems = []
     config = _read_centre(raw, (), problems)
     if problems:
-        raise ConfigError([f"{'.'.join(key)}: {what}" for key, what in problems])
+        raise ConfigError([f"{dotted(key)}: {what}" for key, what in problems])
     return config
 
 
 def config_hash(config: CentreConfig) -> str:
     """A short hash of all settings: equal for equal settings."""
-    plain = json.dumps(dataclasses.asdict(config), sort_keys=True, default=str)
+    plain = json.dumps(dataclasses.asdict(config), sort_keys=True, default=_plain)
     return hashlib.sha256((plain + str(getattr(config.frame, "kind", ""))).encode()).hexdigest()[:16]
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else repr(value)
 
 
 def _read(kind: type[T], raw: Any, where: tuple[str, ...], problems: Problems, base: Any = None) -> T:
@@ -326,7 +332,7 @@ def _read(kind: type[T], raw: Any, where: tuple[str, ...], problems: Problems, b
             continue
         try:
             values[name] = known[name].metadata["read"](value)
-        except ValueError as error:
+        except (ValueError, OverflowError) as error:
             problems.append(((*where, name), str(error)))
     return kind(**values)
 
@@ -367,8 +373,8 @@ def _read_centre(raw: Any, where: tuple[str, ...], problems: Problems) -> Centre
         problems.append(((*where, "keep_gate"), what))
     wrong = {key[len(where)] for key, _ in problems if key[: len(where)] == where and len(key) > len(where)}
     if not wrong & {"rule", "rule_options", "space"}:
-        key = "rule_options" if config.rule_options else "rule"
-        problems.extend(((*where, key), what) for what in _rule_problems(config))
+        place = "rule_options" if config.rule_options else "rule"
+        problems.extend(((*where, place), what) for what in _rule_problems(config))
     return dataclasses.replace(config, source_defaults=defaults, sources=sources)
 
 
@@ -381,46 +387,18 @@ def _rule_problems(config: CentreConfig) -> list[str]:
     if unknown:
         known = ", ".join(options) or "none"
         return [f"{config.rule} has no option {name!r} (known: {known})" for name in unknown]
-    n = len(config.space)
+    n, few = len(config.space), dict(config.rule_options)
+    if isinstance(few.get("samples"), int):
+        few["samples"] = min(few["samples"], 1000)
     for count in (1, 2, 3):
         mean, covariance = np.zeros((count, n, 1)), np.tile(np.eye(n)[:, :, None], (count, 1, 1, 1))
         try:
-            fused = fuse_last(config.rule, mean, covariance, influence=True, **config.rule_options)
-        except (RuleError, TypeError, ValueError) as error:
+            fused = fuse_last(config.rule, mean, covariance, influence=True, **few)
+        except (RuleError, TypeError, ValueError, OverflowError) as error:
             return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} here: {error}"]
         if not np.isfinite(fused.covariance).all():
             return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} of unit covariance here"]
     return []
-
-
-_PART = r"""(?:"[^"\n]*"|'[^'\n]*'|[A-Za-z0-9_\-]+)"""
-_DOTTED = rf"{_PART}(?:\s*\.\s*{_PART})*"
-_HEADER = re.compile(rf"\s*\[\[?\s*({_DOTTED})\s*\]\]?\s*(#.*)?$")
-_KEY = re.compile(rf"\s*({_DOTTED})\s*=")
-
-
-def _key_lines(text: str) -> dict[tuple[str, ...], int]:
-    """Line of every table header and key, for messages (tomllib keeps none)."""
-    lines: dict[tuple[str, ...], int] = {}
-    table: tuple[str, ...] = ()
-    for number, line in enumerate(text.split("\n"), start=1):
-        if header := _HEADER.match(line):
-            table = _parts(header[1])
-            lines.setdefault(table, number)
-        elif key := _KEY.match(line):
-            lines.setdefault((*table, *_parts(key[1])), number)
-    return lines
-
-
-def _parts(dotted: str) -> tuple[str, ...]:
-    return tuple(part.strip("\"'") for part in re.findall(_PART, dotted))
-
-
-def _line_of(lines: dict[tuple[str, ...], int], key: tuple[str, ...]) -> int:
-    for length in range(len(key), 0, -1):
-        if key[:length] in lines:
-            return lines[key[:length]]
-    return 1
 
 
 def example_toml() -> str:
@@ -438,7 +416,7 @@ def example_toml() -> str:
             if one.name in ("source_defaults", "sources"):
                 continue
             value = getattr(table, one.name)
-            text = f"{one.name} = {_toml(value)}" if value is not None else f"# {one.name} ="
+            text = f"{one.name} = {toml_value(value)}" if value is not None else f"# {one.name} ="
             lines.append(f"{text:<44} # {one.metadata['help']}")
         lines.append("")
     lines += [
@@ -446,15 +424,3 @@ def example_toml() -> str:
         "# override = true",
     ]
     return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    if dataclasses.is_dataclass(value):
-        value = {one.name: getattr(value, one.name) for one in fields(value)}
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{key} = {_toml(item)}" for key, item in value.items()) + "}"
-    return json.dumps(value)

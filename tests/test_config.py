@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import tomllib
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,11 +14,13 @@ from fusion_service.config import (
     CentreConfig,
     ConfigError,
     ServiceConfig,
+    SourceConfig,
     centre_config,
     config_hash,
     example_toml,
     load_config,
 )
+from fusion_service.rules import RULES
 
 
 def load(folder: Path, text: str) -> ServiceConfig:
@@ -84,6 +87,63 @@ def test_what_is_wrong_is_said(raw: dict[str, object], words: str) -> None:
     assert words in str(caught.value)
 
 
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        ('[centre]\nframe = {kind = ["enu"], lat = 1, lon = 2}\n', 2, "centre.frame: has kind ['enu'], must be one of"),
+        ('[centre]\nmotion = {kind = "cv", q = "1"}\n', 2, "centre.motion: q is '1', must be a number"),
+        ('[centre]\nframe = {kind = "enu", lat = "59", lon = 1}\n', 2, "centre.frame: lat is '59', must be a number"),
+        ('[centre]\nframe = {kind = "local", name = 3}\n', 2, "centre.frame: name is 3, must be a text"),
+        (f"[centre]\nperiod = 1{'0' * 400}\n", 2, "centre.period: "),
+        ("# a\u2028b\x85c\r\n[centre]\r\nperiod = -1\r\n", 3, "centre.period"),
+        ("\ufeff[centre]\nperiod = -1\n", 2, "centre.period"),
+        ('[centre]\n[centre.sources."radar.1"]\nperiod = -1\n', 3, 'centre.sources."radar.1".period'),
+        ("centre.sources.'radar.1'.period = -1\n", 1, 'centre.sources."radar.1".period'),
+        ("[centre]\nconfirm_hits = 5\nconfirm_within = 4\n", 2, "more than confirm_within, 4"),
+        ("[centre]\ngate = 0.9999\nkeep_gate = 0.9\n", 3, "less than gate, 0.9999"),
+        ("[bus]\nconnect = []\n", 2, "bus.connect: names no hub"),
+    ],
+)
+def test_the_line_and_what_is_wrong_there(tmp_path: Path, text: str, line: int, words: str) -> None:
+    (tmp_path / "centre.toml").write_bytes(text.encode())
+    with pytest.raises(ConfigError) as caught:
+        load_config(tmp_path / "centre.toml")
+    (problem,) = caught.value.problems
+    assert problem.startswith(f"{tmp_path / 'centre.toml'}:{line}: ")
+    assert words in problem
+
+
+@pytest.mark.parametrize("text", ["a = " + "[" * 5000 + "]" * 5000, "[centre]\nmax_pending = " + "9" * 5000])
+def test_what_no_parser_can_take_is_no_toml(tmp_path: Path, text: str) -> None:
+    with pytest.raises(ConfigError, match="not TOML"):
+        load(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("raw", "key", "words"),
+    [
+        ({"rule_options": {"criterion": "best"}}, "rule_options", "criterion 'best': one of det, trace"),
+        ({"rule": "bci", "rule_options": {"max_correlation": 7}}, "rule_options", "must lie between 0 and 1"),
+        ({"rule": "bci", "rule_options": {"max_correlation": [[1, 0], [0, 1]]}}, "rule_options", "has shape (2, 2)"),
+        ({"rule_options": {"scales": [1.0, 1.0]}}, "rule_options", "4 positive numbers"),
+        ({"rule": "hmd-s", "rule_options": {"seed": "x"}}, "rule_options", "seed 'x': a whole number"),
+        ({"rule": "bar-shalom-campo"}, "rule", "takes two sources"),
+    ],
+)
+def test_a_rule_that_could_not_fuse_in_the_centre_is_told(raw: dict[str, object], key: str, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        centre_config(raw)
+    (problem,) = caught.value.problems
+    assert problem.startswith(f"{key}: ")
+    assert words in problem
+
+
+def test_every_other_rule_can_be_chosen_in_four_and_in_nine_dimensions() -> None:
+    for rule in set(RULES) - {"bar-shalom-campo"}:
+        for space in (("x", "y", "vx", "vy"), ("x", "vx", "ax", "y", "vy", "ay", "z", "vz", "az")):
+            assert centre_config({"rule": rule, "space": space}).rule == rule
+
+
 def test_not_toml_and_not_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"not TOML: .*line 2"):
         load(tmp_path, "[centre]\nrule = = 1\n")
@@ -110,3 +170,19 @@ def test_the_hash_tells_configs_apart_and_only_them() -> None:
     ]
     hashes = [config_hash(config) for config in [base, *changed]]
     assert len(set(hashes)) == len(hashes)
+
+
+def test_the_hash_covers_every_field() -> None:
+    base = CentreConfig()
+    other: Any = object()
+    changed = [dataclasses.replace(base, **{one.name: other}) for one in dataclasses.fields(CentreConfig)]
+    for one in dataclasses.fields(SourceConfig):
+        source = dataclasses.replace(base.source_defaults, **{one.name: other})
+        changed += [dataclasses.replace(base, source_defaults=source), dataclasses.replace(base, sources={"a": source})]
+    hashes = [config_hash(config) for config in [base, *changed]]
+    assert len(set(hashes)) == len(hashes)
+
+
+def test_the_hash_is_the_same_for_a_whole_number_and_the_same_number_with_a_point() -> None:
+    whole, point = ({"motion": {"kind": "cv", "q": q}, "period": q} for q in (2, 2.0))
+    assert config_hash(centre_config(whole)) == config_hash(centre_config(point))
