@@ -108,18 +108,19 @@ def _monomials(degree: int, slopes: int) -> FloatArray:
     """From values at 0 and 1, so many slopes there, and values at `_nodes` to coefficients in z = 2t - 1."""
     t = np.array([0.0, 1.0, *_nodes(degree - 1 - slopes)])
     rows = list(np.vander(2.0 * t - 1.0, degree + 1, increasing=True))
-    k = np.arange(degree + 1)
+    k = np.arange(degree + 1.0)
     rows[2:2] = [2.0 * k * (-1.0) ** (k + 1), 2.0 * k][:slopes]
-    return np.linalg.inv(np.array(rows))
+    return np.linalg.inv(np.array(rows, dtype=np.float64))
 
 
 @cache
 def _polar(n: int, slopes: int) -> FloatArray:
     """From the same to the coefficients of q(u)."""
-    k = np.arange(n + 1)
+    k = np.arange(n + 1.0)
     t = np.array([0.0, 1.0, *_nodes(n - 1 - slopes)])[:, None]
     rows = list(t**k * (1.0 - t) ** (n - k))
-    rows[2:2] = [1.0 * (k == 1) - n * (k == 0), 1.0 * n * (k == n) - (k == n - 1)][:slopes]
+    first, last = (k == 1) - float(n) * (k == 0), float(n) * (k == n) - (k == n - 1)
+    rows[2:2] = [first, last][:slopes]
     e = np.linalg.inv(np.array(rows))
     out: FloatArray = k[1:, None] * e[1:] - (n - k[:-1, None]) * e[:-1]
     return out
@@ -142,7 +143,7 @@ def _laguerre(q: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
     if not len(todo):
         return out
     whole = len(todo) == len(out)
-    u, q = (first / -last, q) if whole else ((first[todo] / -last[todo]), q[:, todo])
+    u, q = (first / -last, q) if whole else (first[todo] / -last[todo], q[:, todo])
     m = len(q) - 1
     for _ in range(ROUNDS):
         value, slope, bend = q[m] * u, q[m], None

@@ -149,7 +149,7 @@ def test_means_any_number_of_sigmas_apart(n: int, criterion: str) -> None:
         want = np.linalg.inv(np.linalg.inv(P).sum(axis=0) - V)
         np.testing.assert_allclose(fused.covariance, want, rtol=1e-6, atol=1e-6 * np.trace(want))
         w = fuse("hmd-ga", x, P, criterion=criterion).weights
-        assert 0.0 < w.min()
+        assert w.min() > 0.0
 
 
 def test_scalars_have_the_closed_form_of_section_6_1() -> None:
