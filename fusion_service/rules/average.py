@@ -26,6 +26,8 @@ from .. import linalg
 from ..linalg import FloatArray, inner, total
 from . import search, simplex
 from .harmonic import Mixture
+from .inverse import root
+from .pencil import pencil
 from .sources import Result, Sources
 
 
@@ -40,7 +42,7 @@ def aa(sources: Sources, weights: FloatArray | None, influence: bool, *, criteri
     elif w is None:
         logs = np.log(sources.dets)
         model = Tilted(mixture, logs - total(logs) / sources.count)
-        w = simplex.best_weights("det", model, sources.uniform)
+        w = _of_two(sources) if sources.count == 2 else simplex.best_weights("det", model, sources.uniform)
         M, D = model(w)
         gap, condition = simplex.gap(w, simplex.gradient("det", linalg.inverse(M), D)), sources.condition
     return Result(
@@ -53,6 +55,31 @@ def _full(P: FloatArray) -> FloatArray:
     for i in range(1, len(P)):
         P[:i, i] = P[i, :i]
     return P
+
+
+def _of_two(sources: Sources) -> FloatArray:
+    """Diversity weights (2, B), where both covariances are diagonal and the first is I."""
+    P = sources.covariances
+    _, inverse, r, _ = pencil(P[:, :, 0], P[:, :, 1])
+    d = linalg.matvec(inverse, sources.spread[:, 1])
+    data = np.stack([r, d * d, np.log(r)], axis=1)
+    ends = (_diversity_slope(np.full_like(r[0], t), np.full_like(r[0], 1.0 - t), data)[0] for t in (0.0, 1.0))
+    return root(_diversity_slope, data, *ends)
+
+
+def _diversity_slope(t: FloatArray, u: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """First and second derivative of sum w_i log det P_i - log det P_AA at w = (t, 1 - t).
+
+    With g = t + (1-t) r: det P_AA = prod g (1 + t(1-t) q), q = sum d^2 / g.
+    """
+    r, square, logs = data[:, 0], data[:, 1], data[:, 2]
+    inverse, lean = 1.0 / (t + u * r), 1.0 - r
+    rate = lean * inverse
+    part = square * inverse
+    q, dq, ddq = total(part), -total(part * rate), 2.0 * total(part * rate * rate)
+    s, ds = t * u, u - t
+    f, df, ddf = 1.0 + s * q, ds * q + s * dq, -2.0 * q + 2.0 * ds * dq + s * ddq
+    return -total(rate + logs) - df / f, total(rate * rate) - ddf / f + (df / f) ** 2
 
 
 @dataclass(frozen=True, slots=True)

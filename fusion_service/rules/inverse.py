@@ -38,11 +38,11 @@ from .sources import Result, Sources, condition, weighted_sum
 LIMIT = 6
 """Up to this dimension the weights for det come from symmetric functions; rounding spoils them above."""
 ROUNDS = 100
-Slope = Callable[[FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
+Slope = Callable[[FloatArray, FloatArray, FloatArray], tuple[FloatArray, FloatArray]]
 FLAT = 1e-10
 """Slopes below this, relatively, do not matter: the weight stays at a half."""
-DONE = 1e-11
-"""Stop where one more Newton step gains less than this, relatively."""
+DONE, STEEP = 1e-11, 3e-6
+"""Stop where a Newton step gains less than the one, relatively, from a slope below the other."""
 
 
 def ici(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:
@@ -52,11 +52,7 @@ def ici(sources: Sources, weights: FloatArray | None, influence: bool, *, criter
 
 def _pair(criterion: str, two: Sources, weights: FloatArray | None, influence: bool) -> Pair:
     P, A = two.covariances, two.information
-    if weights is None:
-        t = _best(criterion, two)
-        w = np.stack([t, 1.0 - t])
-    else:
-        w = weights
+    w = _best(criterion, two) if weights is None else weights
     G = weighted_sum(P, w)
     V = linalg.inverse(G)
     everything = weighted_sum(A)
@@ -95,45 +91,45 @@ def _lower_product(A: FloatArray, B: FloatArray) -> FloatArray:
 
 
 def _best(criterion: str, two: Sources) -> FloatArray:
-    """w_1 (B,) with the smallest det P or trace P."""
+    """Weights (2, B) with the smallest det P or trace P."""
     P = two.covariances
     slope: Slope
     if criterion == "det" and two.fast and len(P) <= LIMIT:
         slope, data = _symmetric_slope, _symmetric_functions(two)
         ends = data[-2, 0] / data[-1, 0], data[1, 0]
-        return _root(slope, data, ends[0][0] - ends[0][1], ends[1][1] - ends[1][0])
+        return root(slope, data, ends[0][0] - ends[0][1], ends[1][1] - ends[1][0])
     T, _, r, _ = pencil(P[:, :, 0], P[:, :, 1])
     if criterion == "det":
         slope, data = _det_slope, r[:, None]
     else:
         slope, data = _trace_slope, np.stack([r, total(T * T)], axis=1)
-    zero, one = (slope(np.full_like(r[0], t), data)[0] for t in (0.0, 1.0))
-    return _root(slope, data, zero, one)
+    zero, one = (slope(np.full_like(r[0], t), np.full_like(r[0], 1.0 - t), data)[0] for t in (0.0, 1.0))
+    return root(slope, data, zero, one)
 
 
-def _det_slope(t: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """First and second derivative of log det P."""
+def _det_slope(t: FloatArray, u: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """First and second derivative of log det P by t, at t and u = 1 - t."""
     r = data[:, 0]
-    g, h = t + (1.0 - t) * r, t + (1.0 - t) * (r * r)
+    g, h = t + u * r, t + u * (r * r)
     term = (r - 1.0) * r / (g * h)
     return total(term), total(term * (r - 1.0) * (1.0 / g + (1.0 + r) / h))
 
 
-def _trace_slope(t: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _trace_slope(t: FloatArray, u: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
     """First and second derivative of trace P, over trace P."""
     r, size = data[:, 0], data[:, 1]
-    h = t + (1.0 - t) * (r * r)
+    h = t + u * (r * r)
     term = size * (r / h) * (r / h) * (r - 1.0)
-    scale = 1.0 / total(size * r * (t + (1.0 - t) * r) / h)
+    scale = 1.0 / total(size * r * (t + u * r) / h)
     return total(term) * scale, 2.0 * total(term * (r - 1.0) * (r + 1.0) / h) * scale
 
 
-def _symmetric_slope(t: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _symmetric_slope(t: FloatArray, u: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
     """As `_det_slope`, from `_symmetric_functions`."""
-    n, b, power = len(data) - 1, 1.0 - t, [np.ones_like(t), t]
+    n, power = len(data) - 1, [np.ones_like(t), t]
     for _ in range(2, n + 1):
         power.append(power[-1] * t)
-    (g, h), (dg, dh), (ddg, ddh) = (_form(data[: max(n + 1 - order, 1), order], power, b) for order in range(3))
+    (g, h), (dg, dh), (ddg, ddh) = (_form(data[: max(n + 1 - order, 1), order], power, u) for order in range(3))
     u, v = dg / g, dh / h
     return u - v, ddg / g - u * u - ddh / h + v * v
 
@@ -193,43 +189,48 @@ def _interpolated(s: FloatArray, values: FloatArray) -> FloatArray:
     return out
 
 
-def _root(slope: Slope, data: FloatArray, zero: FloatArray, one: FloatArray) -> FloatArray:
-    """Where in [0, 1] a rising slope passes zero; the better end if nowhere, a half if it is flat.
+def root(slope: Slope, data: FloatArray, zero: FloatArray, one: FloatArray) -> FloatArray:
+    """(t, 1 - t) (2, B) where a rising slope passes zero; the better end if nowhere, a half if it is flat.
 
-    `zero` and `one` are its values at the ends.
+    `zero` and `one` are its values at the ends. The smaller weight is what is searched, so that it keeps its
+    digits.
     """
-    size = data.shape[-1]
-    half, _ = slope(np.full(size, 0.5, data.dtype), data)
-    steep = (zero < -FLAT) | (one > FLAT)
-    lo, hi = np.where(half < 0.0, 0.5, 0.0), np.where(half < 0.0, 1.0, 0.5)
-    # start where (a + b t) / (1 + c t) through the three values is zero: it can follow a pole
-    t = zero / (zero - one * (1.0 + (zero + one - 2.0 * half) / (half - one)))
-    t = np.where((t >= lo) & (t <= hi), t, 0.5 * (lo + hi)).astype(data.dtype)
-    t[~steep] = 0.5
-    t[steep & (zero >= 0.0)] = 0.0
-    t[steep & (one <= 0.0)] = 1.0
-    busy = steep & (zero < 0.0) & (one > 0.0)
-    out, todo = t, np.arange(size)
+    middle = np.full_like(zero, 0.5)
+    half, _ = slope(middle, middle, data)
+    upper = half < 0.0  # then 1 - t is the smaller one, and the slope by it rises too
+    near, far = np.where(upper, -one, zero), np.where(upper, -zero, one)
+    half = np.abs(half)
+    # start where (a + b v) / (1 + c v) through the three values is zero: it can follow a pole
+    v = near / (near - far * (1.0 + (near + far - 2.0 * half) / (half - far)))
+    lo, hi = np.zeros_like(v), middle.copy()
+    v = np.where((v >= lo) & (v <= hi), v, 0.25)
+    steep = (near < -FLAT) | (far > FLAT)
+    v[~steep] = 0.5
+    v[steep & (near >= 0.0)] = 0.0
+    busy = steep & (near < 0.0)
+    out, todo, flip = v, np.arange(len(v)), upper
     for _ in range(ROUNDS):
         left = np.count_nonzero(busy)
         if left <= 0.6 * len(todo):
-            out[todo] = t
+            out[todo] = v
             if not left:
                 break
             at = np.flatnonzero(busy)
-            todo, t, lo, hi, data, busy = todo[at], t[at], lo[at], hi[at], data[..., at], busy[at]
-        h, dh = slope(t, data)
+            todo, v, lo, hi, data, busy, flip = todo[at], v[at], lo[at], hi[at], data[..., at], busy[at], flip[at]
+        rest = 1.0 - v
+        h, dh = slope(np.where(flip, rest, v), np.where(flip, v, rest), data)
+        h = np.where(flip, -h, h)
         rising = h > 0.0
-        np.copyto(hi, t, where=rising)
-        np.copyto(lo, t, where=~rising)
+        np.copyto(hi, v, where=rising)
+        np.copyto(lo, v, where=~rising)
         step = h / dh
-        new = t - step
+        new = v - step
         outside = ~((new >= lo) & (new <= hi))
         new = np.where(outside, 0.5 * (lo + hi), new)
-        np.copyto(t, new, where=busy)
-        # h step is the squared Newton decrement: after this step about its square remains
-        busy &= ~(np.abs(h * step - 0.5 * DONE) <= 0.5 * DONE) | outside
-        busy &= hi - lo > 1e-15
+        np.copyto(v, new, where=busy)
+        # h step is the squared Newton decrement: after this step about its square remains; |h| is the gap
+        busy &= ~((np.abs(h * step) <= DONE) & (np.abs(h) <= STEEP)) | outside
+        busy &= hi - lo > 1e-17 * hi
     else:
-        out[todo] = t
-    return out
+        out[todo] = v
+    return np.stack([np.where(upper, 1.0 - out, out), np.where(upper, out, 1.0 - out)])

@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from strategies import sources
 from test_intersection import gains_of, worst_ratio
 
-from fusion_service.rules import fuse
+from fusion_service.rules import RuleError, fuse
 
 Array = NDArray[np.float64]
 SEED = 2009
@@ -53,6 +53,16 @@ def test_equal_sources_under_ffcc_are_wider_by_delta() -> None:
     fused = fuse("ffcc", x, P, delta=0.8)
     np.testing.assert_allclose(fused.mean, x[0], rtol=1e-12)
     np.testing.assert_allclose(fused.covariance, P[0] / 0.8, rtol=1e-9)
+
+
+def test_equal_sources_under_naive_and_bci() -> None:
+    """As N independent ones, and between that and themselves."""
+    x, P = (np.repeat(a, 4, axis=0) for a in sources(np.random.default_rng(SEED), 1, 3))
+    np.testing.assert_allclose(fuse("naive", x, P).covariance, P[0] / 4, rtol=1e-9)
+    for rho in (0.0, 0.3, 1.0):
+        fused = fuse("bci", x, P, max_correlation=rho)
+        np.testing.assert_allclose(fused.mean, x[0], rtol=1e-12)
+        np.testing.assert_allclose(fused.covariance, P[0] * (1 + 3 * rho) / 4, rtol=1e-9)
 
 
 # ------------------------------------------------------------------ arithmetic average
@@ -167,6 +177,31 @@ def test_cu_is_the_smallest_bound(N: int, n: int, criterion: str) -> None:
         )
         slack = min(np.linalg.eigvalsh(unpack(found.x) - u).min() for u in U)
         assert size(fused.covariance) <= found.fun + 1e-6 + 10 * n * max(0.0, -slack)
+
+
+def test_intersection_and_union_of_ellipsoids_add_up_however_hard() -> None:
+    """T min(r, 1) T' + T max(r, 1) T' = P_1 + P_2, and their determinants multiply to |P_1| |P_2|; or refused."""
+    rng = np.random.default_rng(SEED)
+    done = {True: 0, False: 0}
+    for decades in (0.0, 3.0, 6.0, 9.0, 12.0):
+        for size in (0.0, 6.0, 12.0):
+            for _ in range(4):
+                _, P = sources(rng, 2, 3, decades)
+                unit = 10.0 ** rng.uniform(-3, 3, 3)
+                P *= np.outer(unit, unit)
+                P[1] *= 10.0**size
+                try:
+                    inner, outer = (fuse(rule, np.zeros((2, 3)), P).covariance for rule in ("ei", "cu"))
+                except RuleError:
+                    done[False] += 1
+                    assert decades >= 9.0
+                    continue
+                done[True] += 1
+                np.testing.assert_allclose(inner + outer, P.sum(axis=0), rtol=1e-6, atol=1e-6 * np.abs(P).max())
+                logs = [np.linalg.slogdet(S)[1] for S in (inner, outer, *P)]
+                if decades < 9.0:  # the oracle's own rounding
+                    assert logs[0] + logs[1] == pytest.approx(logs[2] + logs[3], abs=1e-6)
+    assert done[True] >= 36
 
 
 def test_cu_min_and_chain_13() -> None:

@@ -228,6 +228,8 @@ def exact(rule: str, x: Array, P: Array, w: Array) -> Array:
         spread = [[a * b for b in d] for a in d]
         V = invert(combine([w2, w1, w1 * w2], [*Ps, spread]))
         M = combine([Fraction(1), Fraction(1), Fraction(-1)], [*A, V])
+    elif rule == "ici":
+        M = combine([Fraction(1), Fraction(1), Fraction(-1)], [*A, invert(combine([w1, w2], Ps))])
     else:
         M = combine([w1, w2], A)
     return np.array([[float(v) for v in row] for row in invert(M)])
@@ -240,7 +242,7 @@ def hard_covariance(rng: np.random.Generator, n: int, condition: float, scales: 
     return np.asarray(0.5 * (P + P.T) * s[:, None] * s[None, :])
 
 
-@pytest.mark.parametrize("rule", ["naive", "ci", "hmd-ga"])
+@pytest.mark.parametrize("rule", ["naive", "ci", "hmd-ga", "ici", "fast-ci"])
 @pytest.mark.parametrize("criterion", ["det", "trace"])
 def test_hard_input_is_right_or_refused(rule: str, criterion: str) -> None:
     rng = np.random.default_rng(SEED)
