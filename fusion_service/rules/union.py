@@ -89,11 +89,11 @@ def _smallest(criterion: str, start: FloatArray, U: FloatArray) -> tuple[FloatAr
     best, gap = np.array(X), np.full_like(start[0, 0], np.inf)
     todo, t = np.arange(size), np.ones_like(gap)
     for _ in range(ROUNDS):
-        X, done = _newton(X, ends, C, t, sign)
+        X, done, stuck = _newton(X, ends, C, t, sign)
         final = t >= N * n / GAP
-        finished = done & final
+        finished = (done & final) | stuck
         best[..., todo[finished]] = X[..., finished]
-        gap[todo[finished]] = N * n / t[finished]
+        gap[todo[finished]] = np.where(stuck, np.inf, N * n / t)[finished]
         t = np.where(done & ~final, t * FACTOR, t)
         keep = ~finished
         if not keep.any():
@@ -109,8 +109,8 @@ def _smallest(criterion: str, start: FloatArray, U: FloatArray) -> tuple[FloatAr
 
 def _newton(
     X: FloatArray, ends: FloatArray, C: FloatArray | None, t: FloatArray, sign: float
-) -> tuple[FloatArray, NDArray[np.bool_]]:
-    """One damped Newton step of t c(X) - sum log det sign (X - ends_i), and whether it was a small one.
+) -> tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
+    """One damped Newton step of t c(X) - sum log det sign (X - ends_i); whether it was a small one, or none.
 
     c is trace C X, or -log det X where C is None.
     """
@@ -152,4 +152,4 @@ def _newton(
         if (good | low).all():
             break
         length = np.where(good | low, length, 0.5 * length)
-    return X + length * D, decrement < 0.05
+    return np.where(good | low, X + length * D, X), decrement < 0.05, ~(good | low)
