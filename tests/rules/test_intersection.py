@@ -134,6 +134,23 @@ def test_different_bounds_per_pair_use_them_well() -> None:
         assert cost(criterion, np.linalg.inv(fused.covariance)) <= best + 1e-2
 
 
+def test_different_bounds_per_pair_are_searched_from_several_sides() -> None:
+    """Bounds of 0 and 1 make several local optima."""
+    rng = np.random.default_rng(SEED)
+    for _ in range(3):
+        R = np.eye(4)
+        upper = np.triu_indices(4, 1)
+        R[upper] = rng.choice([0.0, 0.05, 0.95, 1.0], size=6)
+        R = np.maximum(R, R.T)
+        for criterion in CRITERIA:
+            x, P = sources(rng, 4, 2)
+            A = np.linalg.inv(P)
+            c = [w / (R @ w) for w in (*rng.dirichlet(np.ones(4), 3000), *rng.dirichlet(np.full(4, 0.3), 1000))]
+            best = min(cost(criterion, np.einsum("i,ijk->jk", one, A)) for one in c)
+            fused = fuse("bci", x, P, criterion=criterion, max_correlation=R)
+            assert cost(criterion, np.linalg.inv(fused.covariance)) <= best + 1e-2
+
+
 def worst_ratio(P: Array, fused: Array, gains: Array, R: Array) -> float:
     """Largest u'Eu / u'Fu over directions u and joint covariances within the bounds R, by optimisation over u.
 
