@@ -42,7 +42,7 @@ class Fused:
     """(..., N), the weights of the rule's own formula; NaN where it has none"""
     influence: FloatArray | None
     """(..., N): trace(K_i) / n, K_i the gain of source i in the fused mean, weights held. Sums to 1. None
-    unless asked for with `influence=True`."""
+    unless asked for with `influence=True`; NaN for the sampled rules, which have no gain."""
 
 
 def fuse(

@@ -16,9 +16,10 @@ For det, all of this is in the elementary symmetric functions e_k of r and E_k o
 sum e_k (1-t)^k t^(n-k): e_1 and e_{n-1} are traces, n - 3 determinants give the rest, and E follows from e
 (Graeffe). The answer is certified by `simplex.gap`.
 
-Promise: conservative under its own correlation structure only, where both sources are an independent part
-fused with a common one whose covariance is not above G. In general it is not: for P_1 = diag(4, 1),
-P_2 = diag(1, 4) and one cross-correlation of .9 the true error exceeds the reported one by 44 %.
+Promise: conservative under its own correlation structure only, where each source is an independent part
+fused with one estimate that is common to both: P_12 = P_1 X P_2 with the common information X (Sharma (54)).
+In general it is not: for P_1 = diag(4, 1), P_2 = diag(1, 4) and one cross-correlation of .9 the true error
+exceeds the reported one by 44 %.
 
 More than two sources are fused pairwise, in the order of `chain`.
 """

@@ -19,12 +19,14 @@ Without given weights: those of `hmd-ga` or `ci` by the criterion. Sources so fa
 effective samples are left are refused. There is no gain: the influence is NaN.
 """
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 
 from .. import linalg
 from ..linalg import FloatArray, total
+from .chain import alone
 from .harmonic import hmd_ga
 from .intersection import ci
 from .pencil import lower_inverse
@@ -45,6 +47,9 @@ def _sampled(
     seed: int,
 ) -> Result:
     n, N, size = sources.means.shape
+    if N == 1:
+        one = alone(sources, influence)
+        return replace(one, covariance=one.covariance * alpha)
     dtype = sources.means.dtype
     wide = Sources(
         sources.means,

@@ -87,6 +87,14 @@ def test_default_weights_are_those_of_the_gaussian_rules() -> None:
             np.testing.assert_allclose(fuse(sampled, x, P, criterion=criterion).weights, want, atol=1e-6)
 
 
+def test_one_source_is_itself_times_alpha() -> None:
+    x, P = sources(np.random.default_rng(SEED), 1, 3)
+    for rule in ("hmd-s", "gmd-s"):
+        fused = fuse(rule, x, P, alpha=1.5)
+        np.testing.assert_array_equal(fused.mean, x[0])
+        np.testing.assert_allclose(fused.covariance, 1.5 * P[0], rtol=1e-14)
+
+
 # ------------------------------------------------------------------ KL dispersion
 
 
@@ -134,3 +142,16 @@ def test_more_sources_reach_a_local_minimum(N: int, n: int) -> None:
         assert here <= spread(np.full(N, 1 / N))
         near = fused.weights * np.exp(0.02 * rng.normal(size=(60, N)))
         assert here <= min(spread(w / w.sum()) for w in near) + 1e-6
+
+
+@pytest.mark.parametrize("N", [2, 3])
+def test_kl_weights_do_not_depend_on_coordinates_or_order(N: int) -> None:
+    rng = np.random.default_rng(SEED)
+    x, P = sources(rng, N, 3)
+    T = rng.normal(size=(3, 3))
+    w = fuse("hmd-ga", x, P, criterion="kl").weights
+    moved = T @ P @ T.T
+    np.testing.assert_allclose(
+        fuse("hmd-ga", x @ T.T, 0.5 * (moved + moved.swapaxes(1, 2)), criterion="kl").weights, w, atol=1e-3
+    )
+    np.testing.assert_allclose(fuse("hmd-ga", x[::-1], P[::-1], criterion="kl").weights[::-1], w, atol=1e-3)
