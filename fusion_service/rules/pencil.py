@@ -30,43 +30,40 @@ def pencil(P1: FloatArray, P2: FloatArray) -> tuple[FloatArray, FloatArray, Floa
 
 def eigen(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues (n, B), in no order, and orthonormal vectors (n, n, B), in columns, of symmetric A."""
-    A = np.array(A)
     n = len(A)
-    Q = np.zeros_like(A)
-    Q[range(n), range(n)] = 1.0
-    eps = np.finfo(A.dtype).eps
-    floor = np.zeros_like(A[0, 0])
-    for k in range(n):
-        floor = np.maximum(floor, np.abs(A[k]).max(axis=0))
-    floor = eps * eps * floor
+    X = np.zeros((2 * n, *A.shape[1:]), A.dtype)  # what is left of A, above the vectors
+    X[:n] = A
+    X[range(n, 2 * n), range(n)] = 1.0
+    eps = 4.0 * np.finfo(A.dtype).eps
+    floor = (eps * eps * np.abs(A).max(axis=(0, 1))) ** 2
     for _ in range(SWEEPS):
         turned = False
         for p in range(n):
             for q in range(p + 1, n):
-                turned = _turn(A, Q, p, q, eps, floor) or turned
+                turned = _turn(X, p, q, eps * eps, floor) or turned
         if not turned:
             break
-    return np.stack([A[k, k] for k in range(n)]), Q
+    return X[range(n), range(n)], X[n:]
 
 
-def _turn(A: FloatArray, Q: FloatArray, p: int, q: int, eps: float, floor: FloatArray) -> bool:
-    """Rotate p and q so that A[p, q] is zero, where it is not small."""
-    b, x, y = A[p, q], A[p, p].copy(), A[q, q].copy()
-    busy = np.abs(b) > eps * np.sqrt(np.abs(x * y)) + floor
+def _turn(X: FloatArray, p: int, q: int, small: float, floor: FloatArray) -> bool:
+    """Rotate p and q so that X[p, q] is zero, where it is not small."""
+    n = X.shape[1]
+    b, x, y = X[p, q].copy(), X[p, p].copy(), X[q, q].copy()
+    square = b * b
+    busy = square > small * np.abs(x * y) + floor
     if not busy.any():
         return False
     half = 0.5 * (y - x)
-    t = np.where(busy, b / (np.abs(half) + np.sqrt(half * half + b * b)), 0.0)
-    t = np.where(half < 0.0, -t, t)
+    t = np.where(busy, b / (half + np.copysign(np.sqrt(half * half + square), half)), 0.0)
     c = 1.0 / np.sqrt(1.0 + t * t)
     s = t * c
-    tb = t * b
-    columns = c * A[:, p] - s * A[:, q], s * A[:, p] + c * A[:, q]
-    A[:, p], A[:, q] = columns
-    A[p], A[q] = columns
-    A[p, p], A[q, q] = x - tb, y + tb
-    A[p, q] = A[q, p] = np.where(busy, 0.0, b)
-    Q[:, p], Q[:, q] = c * Q[:, p] - s * Q[:, q], s * Q[:, p] + c * Q[:, q]
+    one, other = X[:, p], X[:, q]
+    X[:, p], X[:, q] = c * one - s * other, s * one + c * other
+    X[p], X[q] = X[:n, p], X[:n, q]
+    t *= b
+    X[p, p], X[q, q] = x - t, y + t
+    X[p, q] = X[q, p] = np.where(busy, 0.0, b)
     return True
 
 
