@@ -44,7 +44,8 @@ HEARTBEAT = 0.5
 HANDSHAKE = 3.0
 """Seconds that a hub has for the opening of a session; as long may a process that gave up waiting take to end."""
 RETRY = 0.2
-REMIND = 30.0
+FIRST, REMIND = 2.0, 30.0
+"""Seconds until it is told that the hub is waited for, and between that and the next time."""
 MAX_PUBLISHERS = 4096
 
 log = logging.getLogger(__name__)
@@ -346,7 +347,7 @@ def _join(config: zenoh.Config, endpoints: str, wait: bool | float, stop: thread
 
     begin = time.monotonic()
     deadline = None if wait is True or not wait else begin + wait
-    remind = begin + 2 * RETRY
+    remind = begin + FIRST
     threading.Thread(target=attempt, name="bus-join").start()
     try:
         while not changed.wait(0.05):

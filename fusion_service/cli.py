@@ -4,16 +4,39 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import math
 import sys
 import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from fusion_service.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.process import set_up_logging, stop_on_signals
 
 __all__ = ["main"]
 
-ENDPOINT = "tcp/127.0.0.1:7447"
+
+def _endpoint(text: str) -> str:
+    try:
+        return check_endpoint(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _speed(text: str) -> float:
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = math.nan
+    if not 0.0 < speed < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return speed
+
+
+def _seed(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) < 19):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
+    return int(text)
 
 
 class _Help(argparse.RawDescriptionHelpFormatter):
@@ -37,18 +60,32 @@ def _parser() -> argparse.ArgumentParser:
         return sub
 
     hub = command(
-        "hub", "The bus: a Zenoh router that everything else joins.", f"fusion-service hub --listen {ENDPOINT}"
+        "hub", "The bus: a Zenoh router that everything else joins.", f"fusion-service hub --listen {DEFAULT_ENDPOINT}"
     )
-    hub.add_argument("--listen", action="append", metavar="ENDPOINT", help=f"where to listen (default {ENDPOINT})")
+    hub.add_argument(
+        "--listen",
+        action="append",
+        type=_endpoint,
+        metavar="ENDPOINT",
+        help=f"where to listen (default {DEFAULT_ENDPOINT})",
+    )
 
     run = command("run", "The fusion service.", "fusion-service run --config centre.toml")
     run.add_argument("--config", metavar="FILE", help="TOML file (default: all defaults; `check` shows them)")
-    run.add_argument("--connect", action="append", metavar="ENDPOINT", help="hub to join, instead of the config's")
+    run.add_argument(
+        "--connect", action="append", type=_endpoint, metavar="ENDPOINT", help="hub to join, instead of the config's"
+    )
     run.add_argument("--hub", action="store_true", help="hold a hub in this process too (the smallest installation)")
 
     record = command("record", "Record everything on the bus.", "fusion-service record --out mission.rrd")
     record.add_argument("--out", metavar="FILE", help="recording (default runs/mission-<UTC time>.rrd)")
-    record.add_argument("--connect", action="append", metavar="ENDPOINT", help=f"hub to join (default {ENDPOINT})")
+    record.add_argument(
+        "--connect",
+        action="append",
+        type=_endpoint,
+        metavar="ENDPOINT",
+        help=f"hub to join (default {DEFAULT_ENDPOINT})",
+    )
     record.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
     record.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
 
@@ -57,15 +94,19 @@ def _parser() -> argparse.ArgumentParser:
         "A whole mission: hub, service, clients and recorder as processes, then a table, a map and a recording.",
         "fusion-service demo\n"
         "  fusion-service demo --rule hmd-ga --json result.json\n"
-        "  fusion-service demo --scenario autoferry:2 --data DIR --speed 10",
+        "  fusion-service demo --scenario autoferry:2 --data DIR --speed 10\n"
+        "  fusion-service demo --rule bci --set rule_options.max_correlation=0.5 --set gate=0.99",
     )
     demo.add_argument("--scenario", default="three-radars", help="three-radars (default), or autoferry:N")
     demo.add_argument("--data", metavar="DIR", help="folder of the Autoferry files (default: $FUSION_DATA)")
     demo.add_argument("--rule", default="ci", help="fusion rule (default ci; `fusion-service rules` lists them)")
     demo.add_argument("--criterion", help="of the rule's weights: det or trace")
     demo.add_argument("--memory", default="restart", choices=("restart", "recursive"), help="default restart")
-    demo.add_argument("--speed", type=float, default=None, help="times faster than real time (default 10)")
-    demo.add_argument("--seed", type=int, default=1, help="of the simulated sensors (default 1)")
+    demo.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre, above all others"
+    )
+    demo.add_argument("--speed", type=_speed, default=None, help="times faster than real time (default 10)")
+    demo.add_argument("--seed", type=_seed, default=1, help="of the simulated sensors (default 1)")
     demo.add_argument("--out", metavar="DIR", help="folder of the results (default runs/<scenario>-<rule>-<UTC time>)")
     demo.add_argument("--json", metavar="FILE", help="write the scores here")
 
@@ -81,7 +122,7 @@ def _parser() -> argparse.ArgumentParser:
 def _hub(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.hub import run_hub
 
-    run_hub(args.listen or [ENDPOINT], stop)
+    run_hub(args.listen or [DEFAULT_ENDPOINT], stop)
 
 
 def _run(args: argparse.Namespace, stop: threading.Event) -> None:
@@ -105,7 +146,7 @@ def _record(args: argparse.Namespace, stop: threading.Event) -> None:
 
     path = Path(args.out) if args.out else default_path()
     path.parent.mkdir(parents=True, exist_ok=True)
-    with open_bus(args.connect or [ENDPOINT], stop=stop) as bus:
+    with open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop) as bus:
         run_recorder(bus, path, realm=args.realm, stop=stop, cutoff=args.cutoff)
 
 
@@ -117,6 +158,7 @@ def _demo(args: argparse.Namespace, stop: threading.Event) -> None:
         rule=args.rule,
         criterion=args.criterion,
         memory=args.memory,
+        changes=args.set,
         data=args.data,
         speed=args.speed,
         seed=args.seed,
@@ -152,22 +194,29 @@ COMMANDS = {"hub": _hub, "run": _run, "record": _record, "demo": _demo, "check":
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run a command; returns the exit code."""
-    args = _parser().parse_args(argv)
+    try:
+        args = _parser().parse_args(argv)
+        with stop_on_signals() as stop:
+            return _call(args, stop)
+    except KeyboardInterrupt:  # before the handlers were there
+        return 130
+
+
+def _call(args: argparse.Namespace, stop: threading.Event) -> int:
     set_up_logging(args.verbose)
-    from fusion_service.bus import BusError, BusStopped
+    from fusion_service.bus import BusError, BusStopped  # slow to import: only now is a signal heard
     from fusion_service.config import ConfigError
     from fusion_service.demo import DemoError
     from fusion_service.state import StateError
 
-    with stop_on_signals() as stop:
-        try:
-            COMMANDS[args.command](args, stop)
-        except BusStopped:
-            return 0
-        except ConfigError as error:
-            print("\n".join(error.problems), file=sys.stderr)
-            return 2
-        except (BusError, DemoError, StateError, OSError) as error:
-            print(f"fusion-service {args.command}: {error}", file=sys.stderr)
-            return 1
+    try:
+        COMMANDS[args.command](args, stop)
+    except BusStopped:
+        return 0
+    except ConfigError as error:
+        print("\n".join(error.problems), file=sys.stderr)
+        return 2
+    except (BusError, DemoError, StateError, OSError) as error:
+        print(f"fusion-service {args.command}: {error}", file=sys.stderr)
+        return 1
     return 0

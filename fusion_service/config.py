@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from fusion_service.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.toml_text import dotted, key_lines, line_of, toml_value
 from schemas import Ecef, Enu, Frame, Height, Local, Motion, check_name, check_realm, check_space
 
@@ -35,7 +36,6 @@ __all__ = [
 ]
 
 T = TypeVar("T")
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 Problems = list[tuple[tuple[str, ...], str]]
 """What is wrong, with the key where it is."""
 
@@ -156,7 +156,7 @@ def _frame(value: Any) -> Frame | None:
 def _endpoints(value: Any) -> tuple[str, ...]:
     if not (texts := _texts(value)):
         raise ValueError(f"names no hub: write at least one, as in {DEFAULT_ENDPOINT}")
-    return texts
+    return tuple(check_endpoint(text) for text in texts)
 
 
 def _maybe(read: Callable[[Any], T]) -> Callable[[Any], T | None]:

@@ -15,14 +15,17 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Sequence
+import tomllib
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from fusion_service.bus import open_bus
+from fusion_service.config import ConfigError, centre_config, load_config
 from fusion_service.progress import Progress
+from fusion_service.toml_text import dotted, toml_value
 from schemas import GlobalTracks, MessageError, decode, global_key, local_key
 
 __all__ = ["DemoError", "run_demo"]
@@ -53,9 +56,9 @@ class Mission:
     every: float | None
     lateness: float
 
-    def toml(self, speed: float) -> str:
+    def settings(self, speed: float) -> dict[str, Any]:
         """The centre's settings; a client that the machine holds up for `JITTER` seconds is still waited for."""
-        return f"lateness = {max(self.lateness, JITTER * speed)}\n{self.centre}"
+        return {"lateness": max(self.lateness, JITTER * speed), **tomllib.loads(self.centre)}
 
 
 THREE_RADARS = """\
@@ -175,6 +178,7 @@ def run_demo(
     rule: str,
     criterion: str | None,
     memory: str,
+    changes: Sequence[str] = (),
     data: str | None,
     speed: float | None,
     seed: int,
@@ -182,23 +186,30 @@ def run_demo(
     json_path: Path | None,
     stop: threading.Event,
 ) -> dict[str, Any]:
-    """Run a mission and print its scores; returns what the JSON holds. `DemoError` if it cannot be run."""
+    """Run a mission and print its scores; returns what the JSON holds. `ConfigError` or `DemoError` if it cannot
+    be run, before anything is written or started."""
     mission = _mission(scenario, data, seed)
     speed = speed or mission.speed
+    options = {"criterion": criterion} if criterion else {}
+    settings = {"clock": "message", "rule": rule, "rule_options": options, "memory": memory, **mission.settings(speed)}
+    for change in changes:
+        _merge(settings, _setting(change))
+    rule = centre_config(settings).rule
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     folder = out or Path("runs") / f"{scenario.replace(':', '-')}-{rule}-{stamp}"
-    folder.mkdir(parents=True, exist_ok=True)
     recording = folder / "mission.rrd"
     if recording.exists():
         raise DemoError(f"{recording} is there already: give another folder with --out")
+    if json_path is not None:
+        json_path.parent.mkdir(parents=True, exist_ok=True)
+        if json_path.is_dir() or not os.access(json_path.parent, os.W_OK):
+            raise DemoError(f"cannot write {json_path}: give another file with --json")
+    folder.mkdir(parents=True, exist_ok=True)
     config = folder / "centre.toml"
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    options = f'{{criterion = "{criterion}"}}' if criterion else "{}"
-    config.write_text(
-        f'[centre]\nclock = "message"\nrule = "{rule}"\nrule_options = {options}\nmemory = "{memory}"\n'
-        f'{mission.toml(speed)}\n[bus]\nconnect = ["{endpoint}"]\n\n[service]\nstate = "{folder / "state"}"\n'
-    )
-    _check_config(config)
+    tables = {"centre": settings, "bus": {"connect": [endpoint]}, "service": {"state": str(folder / "state")}}
+    config.write_text("".join(map(_toml_table, tables, tables.values())), encoding="utf-8")
+    load_config(config)
     print(f"{scenario}: {mission.seconds:g} s of mission at {speed:g} times real time, into {folder}", flush=True)
     _fly(mission, folder, config, recording, endpoint, speed, stop)
     if stop.is_set():
@@ -207,10 +218,29 @@ def run_demo(
     return _report(mission, rule, recording, folder, json_path)
 
 
-def _check_config(path: Path) -> None:
-    from fusion_service.config import load_config
+def _setting(change: str) -> dict[str, Any]:
+    """What KEY=VALUE says, VALUE as TOML writes it, or a text without its quotes. `ConfigError` if it is neither."""
+    key, equals, value = change.partition("=")
+    if equals and "\n" not in change:
+        for one in (value, toml_value(value.strip())):
+            try:
+                return tomllib.loads(f"{key} = {one}")
+            except (ValueError, RecursionError):
+                continue
+    raise ConfigError([f"--set {change}: write KEY=VALUE, as in --set gate=0.99"])
 
-    load_config(path)
+
+def _merge(into: dict[str, Any], more: Mapping[str, Any]) -> None:
+    """Put `more` into a table, and its tables into those that are there."""
+    for key, value in more.items():
+        if isinstance(value, dict) and isinstance(into.get(key), dict):
+            _merge(into[key], value)
+        else:
+            into[key] = value
+
+
+def _toml_table(name: str, table: Mapping[str, Any]) -> str:
+    return f"[{name}]\n" + "".join(f"{dotted((key,))} = {toml_value(value)}\n" for key, value in table.items()) + "\n"
 
 
 def _fly(
@@ -227,7 +257,8 @@ def _fly(
         crew.start("service", ["fusion_service", "run", "--config", str(config)])
         cutoff = ["--cutoff", str(mission.cutoff)]
         crew.start("record", ["fusion_service", "record", "--out", str(recording), "--connect", endpoint, *cutoff])
-        _wait(lambda: recording.exists() and global_key("centre", "alive") in watch.tokens, crew, stop)
+        token = global_key(load_config(config).centre.name, "alive")
+        _wait(lambda: recording.exists() and token in watch.tokens, crew, stop)
         begin = time.time() + START
         for name, command in mission.clients.items():
             timing = ["--connect", endpoint, "--speed", str(speed), "--start-at", f"{begin:.3f}"]

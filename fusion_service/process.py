@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
@@ -41,23 +40,34 @@ def set_up_logging(verbose: bool = False) -> None:
 
 @contextmanager
 def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT or SIGTERM sets. A second signal, or `GRACE` seconds, end the process at once."""
-    stop = threading.Event()
+    """An event that SIGINT or SIGTERM sets. A second signal, or `GRACE` seconds, end the process at once.
+
+    Both is left to the kernel, so that it also happens while a long call holds the interpreter; only the first
+    signal needs Python to run once.
+    """
+    stop, left = threading.Event(), threading.Event()
 
     def last_resort() -> None:
-        time.sleep(GRACE)
-        sys.stderr.write(f"not stopped within {GRACE:g} s: ending now\n")
-        os._exit(1)
+        if not left.wait(GRACE):
+            sys.stderr.write(f"not stopped within {GRACE:g} s: ending now\n")
+            os._exit(1)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            os._exit(128 + number)
+        for one in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
+            signal.signal(one, signal.SIG_DFL)
+        signal.setitimer(signal.ITIMER_REAL, GRACE + 0.5)
         stop.set()
         threading.Thread(target=last_resort, daemon=True).start()
 
-    before = {number: signal.signal(number, on_signal) for number in (signal.SIGINT, signal.SIGTERM)}
+    handled = (signal.SIGINT, signal.SIGTERM)
+    before = {number: signal.getsignal(number) for number in (*handled, signal.SIGALRM)}
+    for number in handled:
+        signal.signal(number, on_signal)
     try:
         yield stop
     finally:
+        left.set()
+        if stop.is_set():
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)

@@ -56,4 +56,4 @@ def toml_value(value: Any) -> str:
         value = {one.name: getattr(value, one.name) for one in fields(value)}
     if isinstance(value, dict):
         return "{" + ", ".join(f"{dotted((str(key),))} = {toml_value(item)}" for key, item in value.items()) + "}"
-    return json.dumps(value)
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

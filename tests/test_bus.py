@@ -362,7 +362,10 @@ class TestJoining:
             assert 0.3 <= time.monotonic() - begin < 1.3
             timer.join()
 
-    def test_waits_for_a_hub_that_comes_later_and_says_so(self, caplog: pytest.LogCaptureFixture) -> None:
+    def test_waits_for_a_hub_that_comes_later_and_says_so(
+        self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr("fusion_service.bus.FIRST", 0.3)
         hub = Hub()
         timer = threading.Timer(0.6, hub.start)
         timer.start()

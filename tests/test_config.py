@@ -102,6 +102,7 @@ def test_what_is_wrong_is_said(raw: dict[str, object], words: str) -> None:
         ("[centre]\nconfirm_hits = 5\nconfirm_within = 4\n", 2, "more than confirm_within, 4"),
         ("[centre]\ngate = 0.9999\nkeep_gate = 0.9\n", 3, "less than gate, 0.9999"),
         ("[bus]\nconnect = []\n", 2, "bus.connect: names no hub"),
+        ('[bus]\nconnect = ["127.0.0.1:7447"]\n', 2, "bus.connect: '127.0.0.1:7447' is not an endpoint"),
     ],
 )
 def test_the_line_and_what_is_wrong_there(tmp_path: Path, text: str, line: int, words: str) -> None:

@@ -6,16 +6,21 @@ import json
 import math
 import os
 import signal
+import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import fuse_again
 import pytest
 from processes import Program, eventually
 
-from fusion_service.config import load_config
+from fusion_service import demo
+from fusion_service.cli import main
+from fusion_service.config import ConfigError, load_config
+from fusion_service.demo import DemoError, run_demo
 from fusion_service.recording import messages
-from schemas import GlobalTracks, StepLog, Truth
+from schemas import Enu, GlobalTracks, StepLog, Truth
 
 COMMAND = "import sys\nfrom fusion_service.cli import main\nraise SystemExit(main(sys.argv[1:]))"
 PARTS = {
@@ -83,6 +88,79 @@ def test_ctrl_c_in_the_middle_ends_everything_and_the_recording_opens(tmp_path: 
     assert code == 0, errors
     assert processes_with(str(tmp_path)) == []
     assert any(isinstance(message, GlobalTracks) for message in messages(out / "mission.rrd"))
+
+
+def run(folder: Path, **changes: Any) -> None:
+    settings: dict[str, Any] = {
+        "scenario": "three-radars",
+        "rule": "ci",
+        "criterion": None,
+        "memory": "restart",
+        "data": None,
+    }
+    settings |= {"speed": 30.0, "seed": 1, "out": folder / "out", "json_path": None, "stop": threading.Event()}
+    run_demo(**(settings | changes))
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"rule": "magic"}, "rule: is 'magic', must be one of"),
+        ({"criterion": "best"}, "rule_options: ci cannot fuse 1 source here: criterion 'best'"),
+        ({"changes": ["gate=2"]}, "gate: is 2, must be a number"),
+        ({"changes": ["gat=0.9"]}, "gat: unknown key"),
+        ({"changes": ["rule=bci", "rule_options.max_correlation=7"]}, "max_correlation must lie between 0 and 1"),
+        ({"changes": ["gate"]}, "--set gate: write KEY=VALUE"),
+        ({"changes": ["a\nb=1"]}, "write KEY=VALUE"),
+    ],
+)
+def test_settings_that_cannot_be_are_told_before_anything_is_there(
+    tmp_path: Path, changes: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        run(tmp_path, **changes)
+    assert words in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_scores_that_cannot_be_written_are_told_before_anything_is_there(tmp_path: Path) -> None:
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(DemoError, match="give another file with --json"):
+        run(tmp_path, json_path=tmp_path / "taken")
+    assert not (tmp_path / "out").exists()
+
+
+def test_settings_of_the_command_are_above_those_of_the_scenario(tmp_path: Path, monkeypatch: Any) -> None:
+    monkeypatch.setattr(demo, "_fly", lambda *_: None)
+    stop = threading.Event()
+    stop.set()
+    out = tmp_path / 'a "b"\\c \U0001f6a2\x7f'
+    given = ["rule=bci", "rule_options.max_correlation = 0.5", 'memory = "recursive"', "frame.lat=1"]
+    run(tmp_path, out=out, stop=stop, criterion="trace", changes=[*given, "sources.'r.1'.ignore=true"])
+    config = load_config(out / "centre.toml")
+    assert config.service.state == str(out / "state")
+    assert (config.centre.rule, config.centre.memory) == ("bci", "recursive")
+    assert config.centre.rule_options == {"criterion": "trace", "max_correlation": 0.5}
+    assert config.centre.frame == Enu(1.0, -55.2676093)
+    assert config.centre.sources["r.1"].ignore
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("demo", "--speed", "0"),
+        ("demo", "--speed", "nan"),
+        ("demo", "--seed", "-1"),
+        ("hub", "--listen", "127.0.0.1:7447"),
+        ("run", "--connect", "tcp/127.0.0.1:99999"),
+        ("record", "--connect", "nonsense"),
+    ],
+)
+def test_bad_values_of_options_are_bad_usage(arguments: tuple[str, ...], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(arguments)
+    assert caught.value.code == 2
+    assert f"argument {arguments[1]}: {arguments[2]!r} is not " in capsys.readouterr().err
 
 
 @pytest.mark.skipif("FUSION_DATA" not in os.environ, reason="set FUSION_DATA to the folder of the Autoferry recordings")

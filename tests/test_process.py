@@ -1,0 +1,79 @@
+"""Signals in real processes: at any time, and while a call into C holds the interpreter."""
+
+from __future__ import annotations
+
+import signal
+import time
+
+import pytest
+from processes import Program
+
+SLOW_IMPORT = """
+import sys
+class Slow:
+    def find_spec(self, name, path=None, target=None):
+        if name == "fusion_service.bus":
+            print("importing", flush=True)
+            sys.stdin.readline()
+sys.meta_path.insert(0, Slow())
+from fusion_service.cli import main
+raise SystemExit(main(sys.argv[1:]))
+"""
+
+STUCK = """
+import ctypes, sys
+from fusion_service import process
+process.GRACE = float(sys.argv[1])
+with process.stop_on_signals() as stop:
+    print("up", flush=True)
+    stop.wait()
+    print("stopping", flush=True)
+    while True:
+        ctypes.PyDLL(None).sleep(60)  # holds the interpreter
+"""
+
+AFTER = """
+import signal, time
+from fusion_service import process
+process.GRACE = 0.1
+with process.stop_on_signals() as stop:
+    signal.raise_signal(signal.SIGINT)
+    assert stop.is_set()
+time.sleep(1.0)  # longer than any last resort
+assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_modules_are_loaded_ends_it_quietly(number: signal.Signals) -> None:
+    with Program(SLOW_IMPORT, "run", "--connect", "tcp/127.0.0.1:1") as program:
+        assert program.line() == "importing"
+        program.signal(number)
+        code, errors = program.end()  # closes its stdin: the import goes on
+        assert (code, errors) == (0, "")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_second_signal_ends_it_at_once_whatever_it_does(number: signal.Signals) -> None:
+    with Program(STUCK, "60") as program:
+        assert program.line() == "up"
+        program.signal(number)
+        assert program.line() == "stopping"
+        program.signal(number)
+        assert program.end()[0] == -number
+
+
+def test_who_does_not_stop_in_time_is_ended_whatever_it_does() -> None:
+    with Program(STUCK, "0.2") as program:
+        assert program.line() == "up"
+        program.signal(signal.SIGTERM)
+        assert program.line() == "stopping"
+        begin = time.monotonic()
+        assert program.end()[0] == -signal.SIGALRM
+        assert time.monotonic() - begin < 5.0
+
+
+def test_nothing_is_left_of_it_afterwards() -> None:
+    with Program(AFTER) as program:
+        assert program.end() == (0, "")
