@@ -8,7 +8,8 @@ weights 1/|S|, and a source of S without a component there says that nothing is 
 * aa: sum of D_i / |S|, each cell merged to one Gaussian with its mass and moments kept (Li-2nd 5, Li-AA (6)). What
   one of |S| sources denies keeps (|S| - 1) / |S| of its mass.
 * ga: prod D_i^(1/|S|), the power of a sum as the sum of the powers (Li-2nd (49)-(51)), the product taken within a cell
-  only, as Li-2nd 5.2 advises for one target. Exact where cells are far apart. What one source of S denies is gone.
+  only, as Li-2nd 5.2 advises for one target: uniform covariance intersection with a mass, that of the product at its
+  peak over that of a density. Exact where cells are far apart. What one source of S denies is gone.
 * hybrid (Li-2nd 5.2): the mass of aa at the place of ga, which those of S that have a component there give. With
   cardinality "consistent" the mass of all cells with one and the same S becomes the cardinality-consistent mean of the
   expected numbers lambda_i that the sources of S have in these cells (Uney (52)-(53), corrected: `fuse_poisson`).
@@ -26,8 +27,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.association import by_size, candidate_pairs, cluster, pair_distance
-from fusion_service.densities import Mixture, Mixtures, power_product
+from fusion_service.association import by_size, candidate_pairs, cluster, pair_distance, uniform_ci
+from fusion_service.densities import Mixture, Mixtures, log_gaussian
 from fusion_service.existence import fuse_poisson
 from fusion_service.linalg import total
 
@@ -57,6 +58,11 @@ class Components:
     def mass(self) -> float:
         """The expected number."""
         return float(total(self.weight)) if len(self.weight) else 0.0
+
+    def sound(self) -> NDArray[np.bool_]:
+        """Which are finite and positive definite (C,)."""
+        finite = np.isfinite(self.weight) & np.isfinite(self.mean).all(axis=0)
+        return finite & linalg.is_positive_definite(self.covariance)
 
     def mixture(self) -> Mixture | None:
         """The intensity, None if there is nothing."""
@@ -105,8 +111,11 @@ def _merged(parts: Components, group: Ints) -> Components:
 
 
 def reduced(parts: Components, prune: float, distance: float, most: int) -> Components:
-    """Without weights below `prune`, `merge_near`, and of these the `most` heaviest. What is dropped is lost."""
-    merged = merge_near(parts.take((parts.weight > 0) & (parts.weight >= prune)), distance)
+    """Without weights below `prune`, `merge_near`, and of these the `most` heaviest; of more than twice as many only
+    the heaviest are looked at. What is dropped is lost from the mass."""
+    heaviest = np.argsort(-parts.weight, kind="stable")
+    heaviest = heaviest[(parts.weight > 0)[heaviest] & (parts.weight >= prune)[heaviest]]
+    merged = merge_near(parts.take(heaviest[: 2 * most]), distance)
     return merged.take(np.arange(min(most, len(merged.weight))))
 
 
@@ -155,12 +164,12 @@ def fuse_cells(
         if rule == "aa":
             mean[:, ids], covariance[:, :, ids] = Mixtures(logs, means, covariances).moments()
             continue
-        each = [Mixtures(logs[k : k + 1], means[:, k : k + 1], covariances[:, :, k : k + 1]) for k in range(len(rows))]
-        product = power_product(each, np.full(rows.shape, 1.0 / len(rows)))
-        mean[:, ids], covariance[:, :, ids] = product.means[:, 0], product.covariances[:, :, 0]
+        x, P = uniform_ci(np.moveaxis(means, 1, 0), np.moveaxis(covariances, 2, 0))
+        mean[:, ids], covariance[:, :, ids] = x, P
         if rule == "ga":
-            mass[ids] = np.exp(product.log_weights[0])
-    return Components(mass, mean, linalg.symmetrise(covariance), share).take(mass > 0)
+            parts_there = logs + log_gaussian(x[:, None] - means, *linalg.ldl(covariances))
+            mass[ids] = np.exp(total(parts_there) / len(rows) - log_gaussian(np.zeros_like(x), *linalg.ldl(P)))
+    return Components(mass, mean, linalg.symmetrise(covariance), share).take(~(mass <= 0))
 
 
 def _consistency(counted: Floats, cover: NDArray[np.bool_]) -> Floats:

@@ -43,8 +43,8 @@ __all__ = ["IntensityCentre"]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 
-SUPPORT = 0.1
-"""Share of a component's weight that makes a source one of those that support its track."""
+SUPPORT = 0.5
+"""What a source must have of the mean share in a component, of those that have any, to support its track."""
 MOST_TRACKS = 20_000
 
 
@@ -175,10 +175,14 @@ class IntensityCentre:
 
         cell = find_cells(parts, source, self._places, self._gate)
         fused = fuse_cells(config.intensity_rule, config.intensity_cardinality, parts, source, cell, covering)
-        sound = linalg.is_positive_definite(fused.covariance) & np.isfinite(fused.mean).all(axis=0)
+        return self._sound(reduced(self._sound(fused), *limits, config.intensity_components))
+
+    def _sound(self, parts: Components) -> Components:
+        """Without what rounding has spoiled, which is counted."""
+        sound = parts.sound()
         if not sound.all():
             self._journal.refuse(Entry("", 0, 0, 0, "fusion", int((~sound).sum())))
-        return reduced(fused.take(sound), *limits, config.intensity_components)
+        return parts.take(sound)
 
     def _extracted(self) -> int:
         """How many of the components, which come heaviest first, are states."""
@@ -216,7 +220,8 @@ class IntensityCentre:
         mean[:, at], covariance[:, :, at] = fused.mean[:, state], fused.covariance[:, :, state]
         existence[at] = np.minimum(fused.weight[state], 1.0)
         picture = replace(picture, mean=mean, covariance=covariance, existence=existence, time=at_time)
-        self._picture, ended = self._lived(picture, share >= SUPPORT, names, time)
+        supporting = (share > 0) & (share * (share > 0).sum(axis=0) >= SUPPORT)
+        self._picture, ended = self._lived(picture, supporting, names, time)
         return share[:, ~ended]
 
     def _assign(self, mean: Floats, covariance: Floats, states: int) -> tuple[Ints, Floats]:
