@@ -27,6 +27,8 @@ Label = TypeVar("Label", bound=np.generic)
 
 LIGHTEST = 0.05
 """Components of less weight do not open a gate."""
+SOUND = 1e-10
+"""Least pivot, relative to its variance, of what is inverted."""
 TIERS = (8, 64)
 """Neighbours sought of a row, and again of one that has as many; one that has the last number is crowded."""
 CROWD = 256
@@ -50,20 +52,22 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
 def uniform_ci(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
     """Covariance intersection with equal weights: (k, n, B), (k, n, n, B) -> (n, B), (n, n, B).
 
-    Where rounding leaves no sound result (sources with a nearly singular correlation), the source with the
+    Where rounding could spoil the result (a correlation singular to within `SOUND`), the source with the
     smallest determinant stands for all.
     """
     if len(means) == 1:
         return means[0], covariances[0]
-    information = linalg.inverse(covariances[0])
+    information, _, least = linalg.sweep(covariances[0])
     vector = linalg.matvec(information, means[0])
     for mean, covariance in zip(means[1:], covariances[1:], strict=True):
-        inverse = linalg.inverse(covariance)
+        inverse, _, margin = linalg.sweep(covariance)
         information = information + inverse
         vector = vector + linalg.matvec(inverse, mean)
-    covariance = linalg.inverse(information)
+        least = np.minimum(least, margin)
+    covariance, _, margin = linalg.sweep(information)
     x, C = linalg.matvec(covariance, vector), covariance * float(len(means))
-    bad = np.flatnonzero(~(linalg.is_positive_definite(C) & np.isfinite(x).all(axis=0)))
+    sound = (np.minimum(least, margin) > SOUND) & np.isfinite(x).all(axis=0) & np.isfinite(C).all(axis=(0, 1))
+    bad = np.flatnonzero(~sound)
     if len(bad):
         size = np.stack([linalg.logdet(P[:, :, bad]) for P in covariances])
         best = np.argmin(np.where(np.isfinite(size), size, np.inf), axis=0)
@@ -203,18 +207,19 @@ def cluster(
     count = len(members)
     root, bits, holds = np.arange(count), members.copy(), whole.copy()
     nodes: dict[int, list[int]] = {}
-    gated = memoryview(np.sort(i * count + j))
+    keys: Any = np.sort(i * count + j)
+    gated = memoryview(keys)
     joins: list[tuple[int, int, float]] = []
 
     def has(x: int, y: int) -> bool:
         key = min(x, y) * count + max(x, y)
         at = bisect_left(gated, key)
-        return at < len(gated) and gated[at] == key
+        return at < len(gated) and bool(gated[at] == key)
 
     for pairs in _chunks(np.lexsort((j, i, cost))):
-        a, b = root[i[pairs]], root[j[pairs]]
+        one, two = root[i[pairs]], root[j[pairs]]
         # what cannot be joined now never can: clusters only grow
-        pairs = pairs[(a != b) & ((bits[a] & bits[b]) == 0) & ~(holds[a] & holds[b])]
+        pairs = pairs[(one != two) & ((bits[one] & bits[two]) == 0) & ~(holds[one] & holds[two])]
         for first, second, price in zip(i[pairs].tolist(), j[pairs].tolist(), cost[pairs].tolist(), strict=True):
             a, b = sorted((int(root[first]), int(root[second])))
             if a == b or bits[a] & bits[b] or (holds[a] and holds[b]):

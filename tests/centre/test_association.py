@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
@@ -54,6 +55,28 @@ def test_where_rounding_spoils_a_fusion_the_sharpest_source_stands_for_it() -> N
     np.testing.assert_allclose(mean, np.tile(x[:, None], (1, 2)), rtol=1e-12)
     np.testing.assert_allclose(covariance[:, :, 1], fine, rtol=1e-12)
     assert any(np.array_equal(covariance[:, :, 0], one) for one in (good, spoilt))
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.floats(0.5, 15), st.sampled_from([-1, 1])), min_size=2, max_size=3), st.integers(0, 10**6))
+def test_a_nearly_singular_fusion_is_exact_to_four_digits_or_is_one_of_its_sources(
+    correlations: list[tuple[float, int]], seed: int
+) -> None:
+    scale = 10.0 ** np.random.default_rng(seed).uniform(-3, 3, (len(correlations), 2))
+    rho = [sign * (1 - 10.0**-digits) for digits, sign in correlations]
+    P = np.array([[[a * a, r * a * b], [r * a * b, b * b]] for (a, b), r in zip(scale, rho, strict=True)])
+    _, covariance = uniform_ci(np.zeros((len(P), 2, 1)), P[..., None])
+    if any(np.array_equal(covariance[:, :, 0], one) for one in P):
+        return
+
+    def inverse(a: Fraction, b: Fraction, d: Fraction) -> tuple[Fraction, Fraction, Fraction]:
+        det = a * d - b * b
+        return d / det, -b / det, a / det
+
+    informations = [inverse(*(Fraction(float(one[at])) for at in ((0, 0), (0, 1), (1, 1)))) for one in P]
+    a, _, d = inverse(*(sum(parts, Fraction(0)) / len(P) for parts in zip(*informations, strict=True)))
+    assert covariance[0, 0, 0] == pytest.approx(float(a), rel=1e-4)
+    assert covariance[1, 1, 0] == pytest.approx(float(d), rel=1e-4)
 
 
 def test_leave_one_out_is_the_distance_to_the_fusion_of_the_others() -> None:
