@@ -107,6 +107,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     demo.add_argument("--speed", type=_speed, default=None, help="times faster than real time (default 10)")
     demo.add_argument("--seed", type=_seed, default=1, help="of the simulated sensors (default 1)")
+    demo.add_argument(
+        "--tracker",
+        default="ckf",
+        choices=("ckf", "imm", "gm-phd"),
+        help="of the three radars: Gaussians (default), mixtures, or intensities, which an IntensityCentre fuses",
+    )
+    demo.add_argument("--cameras", action="store_true", help="autoferry: the bearing-only cameras too")
     demo.add_argument("--out", metavar="DIR", help="folder of the results (default runs/<scenario>-<rule>-<UTC time>)")
     demo.add_argument("--json", metavar="FILE", help="write the scores here")
 
@@ -162,6 +169,8 @@ def _demo(args: argparse.Namespace, stop: threading.Event) -> None:
         data=args.data,
         speed=args.speed,
         seed=args.seed,
+        tracker=args.tracker,
+        cameras=args.cameras,
         out=Path(args.out) if args.out else None,
         json_path=Path(args.json) if args.json else None,
         stop=stop,

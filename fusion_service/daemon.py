@@ -131,6 +131,8 @@ class Service:
             changed = self._note_tokens()
             self._note_drops()
             self._step_all(stop)
+            if self._message_clock is None:
+                self._warn_set_back()
             if (changed and self._allowed("status", 0.1)) or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
                 self._publish_status()
@@ -264,6 +266,14 @@ class Service:
                 self._step(due)
             else:
                 self._warn_behind(due)
+
+    def _warn_set_back(self) -> None:
+        """The wall clock stands before the last step: none can be made until it has caught up."""
+        seconds = self._wall_clock.behind(time.time_ns())
+        if seconds > self._config.centre.period:
+            self._counts["behind"] += 1
+            if self._allowed("set back", 10.0):
+                log.warning("the clock was set back: no step for another %.0f s", seconds)
 
     def _warn_behind(self, due: int) -> None:
         """The messages' time is before the checkpoint's: no step can be made there again."""

@@ -76,13 +76,17 @@ coast = 3.0
 """
 
 
-def _mission(scenario: str, data: str | None, seed: int) -> Mission:
+def _mission(scenario: str, data: str | None, seed: int, tracker: str, cameras: bool) -> Mission:
     if scenario == "three-radars":
-        command = ["simulate", "three-radars", "--seed", str(seed), "--sensor"]
+        if cameras:
+            raise DemoError("--cameras goes with --scenario autoferry:N")
+        command = ["simulate", "three-radars", "--tracker", tracker, "--seed", str(seed), "--sensor"]
         sensors = ("radar1", "radar2", "radar3", "truth")
         return Mission(
             scenario, {name: [*command, name] for name in sensors}, THREE_RADARS, 300.0, 10.0, 5000.0, None, 15.0
         )
+    if tracker != "ckf":
+        raise DemoError("--tracker goes with --scenario three-radars")
     kind, _, number = scenario.partition(":")
     if kind != "autoferry" or not number.isdigit():
         raise DemoError(f"unknown scenario {scenario!r}: use three-radars, or autoferry:N with N one of 2 3 5 13 16")
@@ -92,7 +96,7 @@ def _mission(scenario: str, data: str | None, seed: int) -> Mission:
     if not (Path(folder) / f"scenario{number}_detections.json").is_file():
         raise DemoError(f"no scenario{number}_detections.json in {folder}: --data names the Autoferry folder")
     command = ["playback", scenario, "--data", str(folder), "--sensor"]
-    clients = {name: [*command, name] for name in ("lidar", "radar", "truth")}
+    clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
     return Mission(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)
 
 
@@ -182,19 +186,24 @@ def run_demo(
     data: str | None,
     speed: float | None,
     seed: int,
+    tracker: str = "ckf",
+    cameras: bool = False,
     out: Path | None,
     json_path: Path | None,
     stop: threading.Event,
 ) -> dict[str, Any]:
     """Run a mission and print its scores; returns what the JSON holds. `ConfigError` or `DemoError` if it cannot
     be run, before anything is written or started."""
-    mission = _mission(scenario, data, seed)
+    mission = _mission(scenario, data, seed, tracker, cameras)
     speed = speed or mission.speed
     options = {"criterion": criterion} if criterion else {}
     settings = {"clock": "message", "rule": rule, "rule_options": options, "memory": memory, **mission.settings(speed)}
+    if tracker == "gm-phd":
+        settings |= {"kind": "intensity", "rule": "ci", "rule_options": {}}
     for change in changes:
         _merge(settings, _setting(change))
-    rule = centre_config(settings).rule
+    centre = centre_config(settings)
+    rule = centre.intensity_rule if centre.kind == "intensity" else centre.rule
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
     folder = out or Path("runs") / f"{scenario.replace(':', '-')}-{rule}-{stamp}"
     recording = folder / "mission.rrd"
