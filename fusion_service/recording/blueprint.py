@@ -67,6 +67,7 @@ def blueprint(frame: Frame | None, bounds: Corners | None, trails: Sequence[str]
         chart("/error", "Error per target (m)"),
         chart("/nees", "NEES per target", 8.0),
         chart("/anees", "Mean NEES", 4.0),
+        chart("/existence", "Existence", 1.05),
         chart("/counts", "Tracks"),
         chart("/influence", "Influence"),
         rrb.TextDocumentView(origin="/health", name="Health"),

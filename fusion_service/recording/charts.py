@@ -4,9 +4,13 @@
 /nees/{centre}/{target}               NEES of the position / dimension, with .../bounds/low and high
 /anees/{centre}/mean                  its mean over the targets, with bounds for their number
 /counts/local/{source}  /counts/{centre}/{status}  /influence/{centre}/{source}
+/counts/local/{source}/mass           expected number of objects, of an intensity
+/existence/{centre}/{track}           existence of each track, from when it is confirmed on
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,8 +19,13 @@ from fusion_service.recording import palette
 from fusion_service.recording.assessment import Score
 from fusion_service.recording.columns import Columns, Stamp, entity, import_rerun
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks
+from schemas.messages import TENTATIVE
 
 __all__ = ["Charts"]
+
+MAX_RUNNING = 100
+MAX_SERIES = 1000
+"""Series of existence of one centre: at a time (each takes Rerun memory as long as it runs), and in all."""
 
 
 class Charts:
@@ -27,12 +36,15 @@ class Charts:
         self._columns = columns
         self._styles: dict[str, tuple[palette.Colour, str, float]] = {}
         self._targets: dict[int, int] = {}
+        self._series: dict[str, dict[int, int]] = {}
 
     def local(self, message: LocalTracks | LocalIntensity, colours: dict[str, palette.Colour], stamp: Stamp) -> None:
-        count = len(message.ids) if isinstance(message, LocalTracks) else float(message.weights.sum())
-        path = entity("counts", "local", message.source)
+        path, name = entity("counts", "local", message.source), message.source
         tone = colours.get(message.source, palette.NEUTRAL)
-        self._add(path, stamp, count, tone, message.source)
+        if isinstance(message, LocalTracks):
+            self._add(path, stamp, len(message.ids), tone, name)
+        else:
+            self._add(f"{path}/mass", stamp, float(message.weights.sum()), tone, f"{name}: mass")
 
     def step(self, message: GlobalTracks, colours: dict[str, palette.Colour], stamp: Stamp) -> None:
         centre = message.source
@@ -47,6 +59,22 @@ class Charts:
         for name, n, part in zip(message.sources, number.tolist(), total.tolist(), strict=True):
             tone = colours.get(name, palette.NEUTRAL)
             self._add(entity("influence", centre, name), stamp, part / n if n else np.nan, tone, name)
+
+    def existence(self, message: GlobalTracks, label: Callable[[int], str], stamp: Stamp) -> int:
+        """Returns how many confirmed tracks have no series, because there are enough."""
+        known = self._series.setdefault(message.source, {})
+        ids = message.ids.tolist()
+        begun = [track for track in ids if track in known]
+        rest = message.ids[message.status != TENTATIVE].tolist()
+        new = [track for track in rest if track not in known]
+        room = max(min(MAX_RUNNING - len(begun), MAX_SERIES - len(known)), 0)
+        known.update((track, len(known) + k) for k, track in enumerate(new[:room]))
+        for track, value in zip(ids, message.existence.tolist(), strict=True):
+            if (number := known.get(track)) is not None:
+                name = label(track)
+                path = entity("existence", message.source, name)
+                self._add(path, stamp, value, palette.series_colour(number), f"track {name}")
+        return max(len(new) - room, 0)
 
     def score(self, score: Score) -> None:
         centre, stamp = score.centre, score.stamp

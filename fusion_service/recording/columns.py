@@ -20,7 +20,7 @@ __all__ = ["Columns", "Lines", "Points", "Stamp", "documents", "entity", "import
 log = logging.getLogger(__name__)
 
 Floats = NDArray[np.float64]
-Colours = NDArray[np.uint32]
+Classes = NDArray[np.uint16]
 
 
 def import_rerun() -> Any:
@@ -50,23 +50,24 @@ class Stamp(NamedTuple):
 @dataclass(frozen=True, slots=True, eq=False)
 class Points:
     """T points of one row: plane (T, 2) as Rerun draws it, east and -north in m; geo (T, 2) latitude and longitude
-    in degrees, None in a frame without a place on Earth; colours (T,) as 0xRRGGBBAA, None for the entity's own."""
+    in degrees, None in a frame without a place on Earth; classes (T,) of the entity's annotation context."""
 
     plane: Floats
     geo: Floats | None
     labels: list[str] | None = None
-    colours: Colours | None = None
+    classes: Classes | None = None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Lines:
-    """S line strips of one row, one after the other: plane (P, 2) and geo (P, 2) as in `Points`; lengths (S,)."""
+    """S line strips of one row, one after the other: plane (P, 2) and geo (P, 2) as in `Points`; lengths (S,);
+    classes (S,) on the plane, widths (S,) in points of the screen, None for the entity's own."""
 
     plane: Floats
     geo: Floats | None
     lengths: NDArray[np.int64]
-    colours: Colours | None = None
-    labels: list[str] | None = None
+    classes: Classes | None = None
+    widths: Floats | None = None
 
 
 Build = Callable[[Any, Sequence[Any]], list[Any]]
@@ -160,8 +161,8 @@ def _points(rr: Any, rows: Sequence[Points]) -> list[Any]:
         geo["positions"] = np.concatenate([row.geo for row in rows if row.geo is not None])
     if rows[0].labels is not None:
         plane["labels"] = [label for row in rows for label in row.labels or ()]
-    if rows[0].colours is not None:
-        plane["colors"] = geo["colors"] = _colours(rows)
+    if rows[0].classes is not None:
+        plane["class_ids"] = geo["class_ids"] = _joined([row.classes for row in rows])
     columns = [*rr.Points2D.columns(**plane)]
     if "positions" in geo:
         columns += rr.GeoPoints.columns(**geo)
@@ -183,17 +184,15 @@ def _lines(rr: Any, rows: Sequence[Lines]) -> list[Any]:
     geo = {}
     if rows[0].geo is not None:
         geo["line_strings"] = strips([row.geo for row in rows], pa.float64(), rr.components.GeoLineStringBatch)
-    if rows[0].colours is not None:
-        plane["colors"] = geo["colors"] = _colours(rows)
-    if rows[0].labels is not None:
-        plane["labels"] = [label for row in rows for label in row.labels or ()]
+    if rows[0].classes is not None:
+        plane["class_ids"] = _joined([row.classes for row in rows])
+    if rows[0].widths is not None:
+        plane["radii"] = geo["radii"] = -0.5 * _joined([row.widths for row in rows])  # negative: of the screen
     columns = [*rr.LineStrips2D.columns(**plane)]
     if "line_strings" in geo:
         columns += rr.GeoLineStrings.columns(**geo)
     return [column.partition(lengths) for column in columns]
 
 
-def _colours(rows: Sequence[Points] | Sequence[Lines]) -> Any:
-    import pyarrow as pa
-
-    return pa.array(np.concatenate([row.colours for row in rows if row.colours is not None]), type=pa.uint32())
+def _joined(parts: Sequence[NDArray[Any] | None]) -> NDArray[Any]:
+    return np.concatenate([part for part in parts if part is not None])

@@ -5,15 +5,19 @@ Entities, each with its places on the plane and, where the frame allows, on the 
     /picture/sensors/{source}            position and name;  .../coverage  edges of the field of view
     /picture/local/{source}              latest tracks;      .../ellipses  95 % of the position;  .../trail
     /picture/global/{centre}             the same, labelled with the id; faint: tentative, dashed: coasting
+    .../components                       the Gaussians of the tracks that are mixtures;  .../ellipses
+    /picture/local/{source}/intensity    those of an intensity;                          .../ellipses
     /picture/truth/{scenario}            true positions;     .../trail
     /grid                                on the plane only
 
-A trail is one short line per track and message; how much of it is seen is a setting of the view.
+A trail is one short line per track and message; how much of it is seen is a setting of the view. A track is drawn by
+the moments of its mixture, over its components. The opacity of a point says its existence, or the weight of its
+component, as class 0..15, whose colours are static: a source's may change when another comes. On the map lines have no
+classes, only widths.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,37 +25,24 @@ from numpy.typing import NDArray
 
 from fusion_service.recording import palette
 from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
-from fusion_service.recording.geometry import Chart, Outline, Place, ellipses, grid, moments, outline
-from schemas import STATUSES, Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
+from fusion_service.recording.geometry import CORNERS, Chart, Outline, Place, ellipses, grid, moments, outline
+from fusion_service.recording.tables import COASTING, LEVELS, Table, components, hold, levels, tabulate
+from schemas import Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
 __all__ = ["Drawing"]
 
 Floats = NDArray[np.float64]
 U64 = NDArray[np.uint64]
 
-TENTATIVE, COASTING = STATUSES.index("tentative"), STATUSES.index("coasting")
-ALPHA = np.array([90, 255, 170])
-"""Of tentative, confirmed and coasting tracks."""
-INTENSITY = 0.1
-"""Components of an intensity that expect less than this are not drawn."""
 DEFAULT_PERIOD = 10.0
 KEPT_PERIODS = 3.0
 """How long, in periods of its source, a track stays drawn that an incomplete message does not list."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Table:
-    """The newest place of each track of one entity, and when it held, ns."""
-
-    epoch: int
-    ids: U64
-    times: NDArray[np.int64]
-    place: Place
-    codes: NDArray[np.uint8]
-
-    def part(self, rows: NDArray[Any]) -> _Table:
-        place = Place(*(column[rows] for column in self.place))
-        return _Table(self.epoch, self.ids[rows], self.times[rows], place, self.codes[rows])
+FAINTEST = 40
+"""Opacity of what hardly exists, of 255."""
+FEW = 100
+"""Components of one message whose ellipses are drawn finely."""
+WIDTH = 1.5
+"""Of the ellipse of a global track, and of a component of weight 1, in points of the screen."""
 
 
 class Drawing:
@@ -66,7 +57,9 @@ class Drawing:
         self.colours: dict[str, palette.Colour] = {}
         self.changed = True
         self._generations: dict[int, int] = {}
-        self._tables: dict[str, _Table] = {}
+        self._tables: dict[str, Table] = {}
+        self._tones: dict[str, palette.Colour] = {}
+        self._mixed: set[str] = set()
         self._recolour = False
         self._info: dict[str, SensorInfo] = {}
         self._extents: dict[bool, tuple[Floats, Floats]] = {}
@@ -114,97 +107,142 @@ class Drawing:
         lengths = np.array([len(edge) for edge in edges], dtype=np.int64)
         self._columns.lines(f"{path}/coverage", stamp, self._lines(xy, z, lengths))
 
-    def local_tracks(self, message: LocalTracks | LocalIntensity, sound: NDArray[np.bool_], stamp: Stamp) -> None:
-        """`sound` (T,): the tracks that are drawn. Of an intensity, the components that expect a good part of an
-        object, labelled with their weight."""
+    def local_tracks(self, message: LocalTracks, sound: NDArray[np.bool_], stamp: Stamp) -> int:
+        """`sound` (T,): the tracks that are drawn. Returns how many components are too many to draw."""
         self._source(message.source)
-        shown = sound & (message.weights >= INTENSITY) if isinstance(message, LocalIntensity) else sound
-        drawn = np.flatnonzero(shown)
         means, covariances = moments(message)
-        place = self._chart.place(means[drawn], covariances[drawn], message.space, message.frame, message.height)
-        ids = drawn.astype(np.uint64) if isinstance(message, LocalIntensity) else message.ids[drawn]
-        table = _table(message.epoch, message.time, ids, place, np.ones(len(ids), dtype=np.uint8))
+        place = self._chart.place(means[sound], covariances[sound], message.space, message.frame, message.height)
+        ids = message.ids[sound]
+        mass = None if message.existence is None else message.existence[sound]
+        table = tabulate(message.epoch, message.time, ids, place, mass=mass)
         self._grow(table.place.xy, main=False)
-        path = entity("picture", "local", message.source)
-        if isinstance(message, LocalIntensity):
-            labels = [f"{message.weights[row]:.2f}" for row in table.ids.tolist()]
-            self._tables[path] = table
-        else:
-            period = self._info[message.source].period if message.source in self._info else DEFAULT_PERIOD
-            keep = 0 if message.complete else round(KEPT_PERIODS * period * 1e9)
-            table = self._trail(path, table, keep, stamp)
-            labels = [str(track) for track in table.ids.tolist()]
-        self._columns.points(path, stamp, self._points(table.place, labels))
+        path = self.sources[message.source]
+        period = self._info[message.source].period if message.source in self._info else DEFAULT_PERIOD
+        keep = 0 if message.complete else round(KEPT_PERIODS * period * 1e9)
+        over = self._components(f"{path}/components", message, sound, stamp, keep)
+        table = self._trail(path, table, message.time, keep, stamp)
+        self._tracks(path, table, [str(track) for track in table.ids.tolist()], stamp)
         self._ellipses(path, table, stamp)
+        return over
 
-    def global_tracks(self, message: GlobalTracks, sound: NDArray[np.bool_], stamp: Stamp) -> None:
-        """`sound` (T,): the tracks that are drawn."""
+    def intensity(self, message: LocalIntensity, sound: NDArray[np.bool_], stamp: Stamp) -> int:
+        """`sound` (C,): the components that are drawn. Returns how many are too many to draw."""
+        self._source(message.source)
+        return self._components(f"{self.sources[message.source]}/intensity", message, sound, stamp)
+
+    def global_tracks(self, message: GlobalTracks, sound: NDArray[np.bool_], stamp: Stamp) -> int:
+        """`sound` (T,): the tracks that are drawn. Returns how many components are too many to draw."""
         means, covariances = moments(message)
         place = self._chart.place(means[sound], covariances[sound], message.space, message.frame)
-        table = _table(message.epoch, message.time, message.ids[sound], place, message.status[sound])
+        status, mass = message.status[sound], message.existence[sound]
+        table = tabulate(message.epoch, message.time, message.ids[sound], place, status, mass)
         self._grow(table.place.xy, main=True)
         path = entity("picture", "global", message.source)
         if self._first(path):
-            self._style(path, palette.FUSED, radius=4.5, width=1.5, alpha=255, labels=True)
-        table = self._trail(path, table, 0, stamp)
-        labels = [self.label(track) for track in table.ids.tolist()]
-        colours = palette.packed(palette.FUSED, 0) + ALPHA.astype(np.uint32)[table.codes]
-        self._columns.points(path, stamp, self._points(table.place, labels, colours.astype(np.uint32)))
-        self._ellipses(path, table, stamp, colours.astype(np.uint32))
+            self._style(path, palette.FUSED, radius=4.5, width=WIDTH, alpha=255, labels=True, weighed=True)
+        over = self._components(f"{path}/components", message, sound, stamp)
+        table = self._trail(path, table, message.time, 0, stamp)
+        self._tracks(path, table, [self.label(track) for track in table.ids.tolist()], stamp)
+        self._ellipses(path, table, stamp, weighed=True, dashed=True)
+        return over
 
     def truth(self, message: Truth, stamp: Stamp) -> None:
         n = len(message.space)
         place = self._chart.place(message.means, np.zeros((len(message.ids), n, n)), message.space, message.frame)
-        table = _table(message.epoch, message.time, message.ids, place, np.ones(len(message.ids), dtype=np.uint8))
+        table = tabulate(message.epoch, message.time, message.ids, place)
         self._grow(table.place.xy, main=True)
         path = entity("picture", "truth", message.source)
         if self._first(path):
             self._style(path, palette.TRUTH, radius=2.0, width=0.5, alpha=255, labels=False)
-        table = self._trail(path, table, 0, stamp)
-        self._columns.points(path, stamp, self._points(table.place, [f"target {track}" for track in table.ids]))
+        table = self._trail(path, table, message.time, 0, stamp)
+        self._tracks(path, table, [f"target {track}" for track in table.ids.tolist()], stamp)
 
     def clear(self, source: str, stamp: Stamp) -> None:
         """Draw no tracks of `source` until it sends again."""
-        path = entity("picture", "local", source)
-        table = self._tables.pop(path, None)
-        if table is not None:
-            nothing = table.part(np.zeros(0, dtype=np.intp))
-            self._columns.points(path, stamp, self._points(nothing.place, labels=[]))
-            self._ellipses(path, nothing, stamp)
+        own = entity("picture", "local", source)
+        for path in (own, f"{own}/components", f"{own}/intensity"):
+            table = self._tables.pop(path, None)
+            if table is not None:
+                nothing = table.part(np.zeros(0, dtype=np.intp))
+                self._tracks(path, nothing, [], stamp)
+                self._ellipses(path, nothing, stamp, weighed=path != own)
+
+    def _components(
+        self,
+        path: str,
+        message: LocalTracks | LocalIntensity | GlobalTracks,
+        sound: NDArray[np.bool_],
+        stamp: Stamp,
+        keep: int = 0,
+    ) -> int:
+        """Draw the components of mixtures, labelled with their weights: a row if there are any, or were before.
+        Returns how many are too many."""
+        rows, owner, weights, over = components(message, sound)
+        if not len(rows) and path not in self._tables:
+            return 0
+        height = None if isinstance(message, GlobalTracks) else message.height
+        means, covariances = message.means[rows], message.covariances[rows]
+        place = self._chart.place(means, covariances, message.space, message.frame, height)
+        whole = isinstance(message, LocalIntensity)
+        tracks = np.arange(len(sound), dtype=np.uint64) if isinstance(message, LocalIntensity) else message.ids
+        codes = message.status[owner] if isinstance(message, GlobalTracks) else None
+        table = tabulate(message.epoch, message.time, tracks[owner], place, codes, weights)
+        if whole:
+            self._grow(table.place.xy, main=False)
+        if path not in self._mixed:
+            self._mixed.add(path)
+            self._style_components(path)
+        table = self._hold(path, table, tracks, message.time, keep)
+        name = self.label if isinstance(message, GlobalTracks) else str
+        pairs = zip(table.ids.tolist(), table.mass.tolist(), strict=True)
+        labels = [f"{weight:.2f}" if whole else f"{name(track)}: {weight:.2f}" for track, weight in pairs]
+        self._tracks(path, table, labels, stamp)
+        self._ellipses(path, table, stamp, weighed=True)
+        return over
 
     @property
     def _chart(self) -> Chart:
         assert self.chart is not None, "open_chart comes first"
         return self.chart
 
-    def _points(self, place: Place, labels: list[str], colours: NDArray[np.uint32] | None = None) -> Points:
-        return Points(self._chart.plane(place.xy), self._chart.geo(place.xy, place.z), labels, colours)
+    def _points(self, place: Place, labels: list[str], classes: NDArray[np.uint16] | None = None) -> Points:
+        return Points(self._chart.plane(place.xy), self._chart.geo(place.xy, place.z), labels, classes)
 
-    def _lines(
-        self, xy: Floats, z: Floats, lengths: NDArray[np.int64], colours: NDArray[np.uint32] | None = None
-    ) -> Lines:
-        return Lines(self._chart.plane(xy), self._chart.geo(xy, z), lengths, colours)
+    def _tracks(self, path: str, table: Table, labels: list[str], stamp: Stamp) -> None:
+        self._columns.points(path, stamp, self._points(table.place, labels, levels(table)))
 
-    def _ellipses(self, path: str, table: _Table, stamp: Stamp, colours: NDArray[np.uint32] | None = None) -> None:
-        drawn: Outline = ellipses(table.place, table.codes == COASTING)
+    def _lines(self, xy: Floats, z: Floats, lengths: NDArray[np.int64], **looks: Any) -> Lines:
+        return Lines(self._chart.plane(xy), self._chart.geo(xy, z), lengths, **looks)
+
+    def _ellipses(self, path: str, table: Table, stamp: Stamp, *, weighed: bool = False, dashed: bool = False) -> None:
+        """`weighed`: opacity and width by mass. `dashed`: while a track coasts."""
+        corners = CORNERS if dashed or not weighed or len(table.ids) <= FEW else CORNERS // 2
+        drawn: Outline = ellipses(table.place, (table.codes == COASTING) & dashed, corners)
         z = np.repeat(table.place.z[drawn.owner], drawn.lengths)
-        shown = None if colours is None else colours[drawn.owner]
-        self._columns.lines(f"{path}/ellipses", stamp, self._lines(drawn.xy, z, drawn.lengths, shown))
+        looks: dict[str, Any] = {}
+        if weighed:
+            classes = levels(table)[drawn.owner]
+            looks = {"classes": classes, "widths": WIDTH * (0.2 + 0.8 * classes / (LEVELS - 1))}
+        self._columns.lines(f"{path}/ellipses", stamp, self._lines(drawn.xy, z, drawn.lengths, **looks))
 
-    def _trail(self, path: str, new: _Table, keep: int, stamp: Stamp) -> _Table:
-        """Draw a line from each track's place before to its place in `new`. Returns what is drawn now: `new`, and
-        what was known at most `keep` ns ago. One that is older than the last is drawn alone, at its own time."""
+    def _trail(self, path: str, new: Table, time: int, keep: int, stamp: Stamp) -> Table:
+        """Draw a line from each track's place before to its place in `new`, and see `_hold`."""
         old = self._tables.get(path)
-        if old is not None and old.epoch == new.epoch and len(old.ids):
-            if len(new.ids) and new.times[0] < old.times.max():
-                return new
+        if old is not None and old.epoch == new.epoch and len(old.ids) and time >= old.times.max():
             _, before, after = np.intersect1d(old.ids, new.ids, assume_unique=True, return_indices=True)
             ends = np.stack([old.place.xy[before], new.place.xy[after]], axis=1).reshape(-1, 2)
             z = np.stack([old.place.z[before], new.place.z[after]], axis=1).reshape(-1)
             self._columns.lines(f"{path}/trail", stamp, self._lines(ends, z, np.full(len(before), 2)))
-            if keep and stamp.time is not None:
-                standing = ~np.isin(old.ids, new.ids) & (old.times >= stamp.time - keep)
-                new = _join(old.part(np.flatnonzero(standing)), new)
+        return self._hold(path, new, new.ids, time, keep)
+
+    def _hold(self, path: str, new: Table, listed: U64, time: int, keep: int) -> Table:
+        """What is drawn now: `new`, and what was known at most `keep` ns ago of tracks that are not `listed`. A
+        message older than the last is drawn alone, at its own time."""
+        old = self._tables.get(path)
+        if old is not None and old.epoch == new.epoch and len(old.ids) and time < old.times.max():
+            return new
+        if keep:
+            new = hold(old, new, listed, time - keep)
         self._tables[path] = new
         return new
 
@@ -246,14 +284,34 @@ class Drawing:
         width: float,
         alpha: int,
         labels: bool,
+        weighed: bool = False,
     ) -> None:
         """What all rows of an entity, its ellipses and its trail share; sizes in points of the screen."""
         rr, static = self._rr, self._columns.static
-        static(path, *_both(rr, "Points", colors=[palette.packed(colour)], radii=[-radius]))
+        self._tones[path] = colour
+        alphas = np.linspace(FAINTEST, 255, LEVELS).round().astype(int).tolist()
+        shades = [palette.packed(colour, opacity) for opacity in alphas]
+        static(path, rr.AnnotationContext([rr.AnnotationInfo(k, color=shade) for k, shade in enumerate(shades)]))
+        static(path, *_both(rr, "Points", radii=[-radius]))
         static(path, rr.Points2D.from_fields(show_labels=labels))
         faint = palette.packed(colour, alpha)
-        static(f"{path}/ellipses", *_both(rr, "Lines", colors=[faint], radii=[-width]))
+        edge = _both(rr, "Lines", colors=[faint], radii=[-width])
+        if weighed:  # what is static counts, whatever the rows say
+            edge = (rr.GeoLineStrings.from_fields(colors=[faint]),)
+        static(f"{path}/ellipses", *edge)
         static(f"{path}/trail", *_both(rr, "Lines", colors=[faint], radii=[-0.75 * width]))
+        for part in self._mixed.intersection((f"{path}/components", f"{path}/intensity")):
+            self._style_components(part)
+
+    def _style_components(self, path: str) -> None:
+        """Under the tracks; the colours of their entity, once it has one."""
+        rr, static = self._rr, self._columns.static
+        if (colour := self._tones.get(path.rpartition("/")[0])) is None:
+            return
+        static(path, *_both(rr, "Points", radii=[-2.0]))
+        static(path, rr.Points2D.from_fields(show_labels=False, draw_order=12.0))
+        static(f"{path}/ellipses", rr.GeoLineStrings.from_fields(colors=[palette.packed(colour)]))
+        static(f"{path}/ellipses", rr.LineStrips2D.from_fields(draw_order=11.0))
 
     def _grow(self, xy: Floats, *, main: bool) -> None:
         """Let the extent hold `xy` (T, 2); the grid and the view follow in steps."""
@@ -272,7 +330,8 @@ class Drawing:
         self.changed = True
         lines, labels = grid(*self._grid)
         rr, tone = self._rr, palette.packed(palette.GRID)
-        self._columns.static("/grid", rr.LineStrips2D([line * (1, -1) for line in lines], colors=[tone], radii=[-0.5]))
+        plane = [line * (1, -1) for line in lines]
+        self._columns.static("/grid", rr.LineStrips2D(plane, colors=[tone], radii=[-0.5], draw_order=1.0))
         corner = centre - 0.94 * half
         places = [np.where(line[0] == line[1], line[0], corner) * (1, -1) for line in lines]
         text = palette.packed(palette.TRUTH)
@@ -284,24 +343,6 @@ class Drawing:
         return self._grid
 
 
-def _both(rr: Any, kind: str, **fields: Any) -> tuple[Any, Any]:
+def _both(rr: Any, kind: str, **fields: Any) -> tuple[Any, ...]:
     plane, geo = {"Points": (rr.Points2D, rr.GeoPoints), "Lines": (rr.LineStrips2D, rr.GeoLineStrings)}[kind]
     return plane.from_fields(**fields), geo.from_fields(**fields)
-
-
-def _table(epoch: int, time: int, ids: U64, place: Place, codes: NDArray[np.uint8]) -> _Table:
-    """A table of one message, without what is not to be placed (its vertical misses the Earth)."""
-    table = _Table(epoch, ids, np.full(len(ids), time), place, codes)
-    good = np.isfinite(place.xy).all(axis=1) & np.isfinite(place.covariance).all(axis=(1, 2))
-    return table if good.all() else table.part(np.flatnonzero(good))
-
-
-def _join(first: _Table, second: _Table) -> _Table:
-    place = Place(*(np.concatenate(pair) for pair in zip(first.place, second.place, strict=True)))
-    return _Table(
-        second.epoch,
-        np.concatenate([first.ids, second.ids]),
-        np.concatenate([first.times, second.times]),
-        place,
-        np.concatenate([first.codes, second.codes]),
-    )

@@ -97,19 +97,21 @@ class Chart:
         return np.stack([lat, lon], axis=-1)
 
 
-def ellipses(place: Place, dashed: NDArray[np.bool_]) -> Outline:
-    """The 95 % ellipse of each position; that of a `dashed` (T,) one in eight strips."""
+def ellipses(place: Place, dashed: NDArray[np.bool_], corners: int = CORNERS) -> Outline:
+    """The 95 % ellipse of each position, a polygon of `corners` (a divisor of 24); that of a `dashed` (T,) one in
+    every second of three."""
     a, b, c = (place.covariance[:, i, j] for i, j in ((0, 0), (1, 0), (1, 1)))
     across = np.sqrt(a)
     slope = b / across
     along = np.sqrt(np.maximum(c - slope * slope, 0.0))
-    offsets = np.stack([across[:, None] * RING[0], slope[:, None] * RING[0] + along[:, None] * RING[1]], axis=-1)
+    cos, sin = RING[:, :: CORNERS // corners]
+    offsets = np.stack([across[:, None] * cos, slope[:, None] * cos + along[:, None] * sin], axis=-1)
     rings = place.xy[:, None, :] + math.sqrt(QUANTILE) * offsets
     solid, broken = np.flatnonzero(~dashed), np.flatnonzero(dashed)
-    strips = CORNERS // 3
+    strips = corners // 3
     return Outline(
-        np.concatenate([rings[solid].reshape(-1, 2), rings[broken, :CORNERS].reshape(-1, 2)]),
-        np.concatenate([np.full(len(solid), CORNERS + 1), np.full(strips * len(broken), 3)]),
+        np.concatenate([rings[solid].reshape(-1, 2), rings[broken, :corners].reshape(-1, 2)]),
+        np.concatenate([np.full(len(solid), corners + 1), np.full(strips * len(broken), 3)]),
         np.concatenate([solid, np.repeat(broken, strips)]),
     )
 

@@ -40,7 +40,7 @@ AHEAD = 3600 * 10**9
 """Nanoseconds by which a message may be ahead of the newest global one and still be on the mission's timeline."""
 MAX_SOURCES = 256
 MAX_TRACKS = 5000
-"""Sources, and tracks of one message, that are drawn; an ellipse takes 600 B."""
+"""Sources, and tracks of one message, that are drawn; an ellipse takes 600 B. `tables` bounds the components."""
 MAX_ASSESSED = 1000
 """Tracks and true objects of a step that are assigned to each other."""
 
@@ -127,7 +127,7 @@ class Scene:
 
     def _unfit(self, message: Message) -> str:
         """Why a message as a whole is not drawn; empty if it is."""
-        if not isinstance(message, SensorInfo | Status | StepLog) and len(message.means) > MAX_TRACKS:
+        if isinstance(message, LocalTracks | GlobalTracks | Truth) and len(message.ids) > MAX_TRACKS:
             return f"more than {MAX_TRACKS} tracks"
         new = isinstance(message, LocalTracks | LocalIntensity | SensorInfo)
         if new and message.source not in self.drawing.sources and len(self.drawing.sources) >= MAX_SOURCES:
@@ -156,11 +156,21 @@ class Scene:
             if self._assessable(message, stamp):
                 self._assessment.step(message, stamp)
             if drawing.chart is not None:
-                drawing.global_tracks(message, sound, stamp)
+                self._too_many(message, "components", drawing.global_tracks(message, sound, stamp), stamp)
             charts.step(message, drawing.colours, stamp)
+            unseen = charts.existence(message, drawing.label, stamp)
+            self._too_many(message, "series of existence", unseen, stamp)
         else:
-            drawing.local_tracks(message, sound, stamp)
+            if isinstance(message, LocalTracks):
+                over = drawing.local_tracks(message, sound, stamp)
+            else:
+                over = drawing.intensity(message, sound, stamp)
+            self._too_many(message, "components", over, stamp)
             charts.local(message, drawing.colours, stamp)
+
+    def _too_many(self, message: Message, what: str, count: int, stamp: Stamp) -> None:
+        if count:
+            self._leave_out(message.source, f"too many {what}", count, stamp)
 
     def _assessable(self, message: GlobalTracks | Truth, stamp: Stamp) -> bool:
         few = len(message.ids) <= MAX_ASSESSED

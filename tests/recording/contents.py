@@ -40,6 +40,22 @@ def row(path: Path, entity: str, time: int) -> dict[str, Any]:
     return found
 
 
+def static(path: Path, entity: str) -> dict[str, Any]:
+    """What holds at all times for `entity`: each component's instances, those said last."""
+    found: dict[str, Any] = {}
+    for chunk in RrdReader(path).stream().filter(content=entity):
+        if chunk.is_static:
+            batch = chunk.to_record_batch()
+            found |= {name: batch.column(name).to_pylist()[-1] for name in batch.schema.names if ":" in name}
+    return found
+
+
+def opacities(path: Path, entity: str) -> dict[int, int]:
+    """The alpha, 0 to 255, of each class of `entity`."""
+    (context,) = static(path, entity)["AnnotationContext:context"]
+    return {item["class_id"]: item["class_description"]["info"]["color"] & 0xFF for item in context}
+
+
 def entities(path: Path) -> set[str]:
     return {chunk.entity_path for chunk in RrdReader(path).stream()}
 

@@ -10,14 +10,14 @@ import missions
 import numpy as np
 import pymap3d
 import pytest
-from recording.contents import record, row, rows, texts
+from recording.contents import opacities, record, row, rows, texts
 from recording.mission import LOST, RADARS, START, TARGETS, Sent
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from fusion_service.recording import read
 from fusion_service.recording.geometry import moments
-from schemas import Ecef, Enu, Local, LocalIntensity, Message, Polygon, encode, global_key, local_key
+from schemas import Ecef, Enu, Local, Message, Polygon, encode, global_key, local_key
 
 SECOND = 10**9
 
@@ -28,7 +28,7 @@ def test_a_recording_brings_its_own_layout(flown: tuple[Path, list[Sent]]) -> No
     layouts = reader.blueprints()
     assert layouts
     shown = {str(chunk.to_record_batch()) for chunk in reader.stream(store=layouts[-1])}
-    for name in ("Map", "Local picture", "Error per target", "NEES per target", "Status log"):
+    for name in ("Map", "Local picture", "Error per target", "NEES per target", "Existence", "Status log"):
         assert any(name in text for text in shown)
 
 
@@ -62,14 +62,15 @@ def test_ellipses_hold_95_percent_and_are_dashed_while_a_track_coasts(flown: tup
     assert coasting.any()
 
 
-def test_labels_trails_and_colours_of_global_tracks(flown: tuple[Path, list[Sent]]) -> None:
+def test_labels_trails_and_opacity_of_global_tracks(flown: tuple[Path, list[Sent]]) -> None:
     path, _ = flown
     first, second, third = (START + step * SECOND for step in (2, 3, 4))
     before, now = (row(path, "/picture/global/main", at) for at in (first, second))
     assert now["Points2D:labels"] == [str(n) for n in range(1, TARGETS + 1)]
-    alphas = [{colour & 0xFF for colour in drawn["Points2D:colors"]} for drawn in (before, now)]
-    assert [len(values) for values in alphas] == [1, 1]
-    assert max(alphas[0]) < max(alphas[1]) == 255  # tentative ones are faint
+    shades = opacities(path, "/picture/global/main")
+    alphas = [[shades[level] for level in drawn["Points2D:class_ids"]] for drawn in (before, now)]
+    assert [len(set(values)) for values in alphas] == [1, 1]
+    assert 40 < alphas[0][0] < 150 < 240 < alphas[1][0] <= 255  # tentative ones are faint
     trail = row(path, "/picture/global/main/trail", second)["LineStrips2D:strips"]
     ends = [before["Points2D:positions"], now["Points2D:positions"]]
     np.testing.assert_array_equal(np.array(trail), np.swapaxes(np.array(ends), 0, 1))
@@ -152,18 +153,6 @@ def test_a_mixture_is_drawn_by_its_moments() -> None:
         first = w @ means[part]
         np.testing.assert_allclose(mean[track], first)
         np.testing.assert_allclose(covariance[track], second - np.outer(first, first), rtol=1e-9, atol=1e-9)
-
-
-def test_an_intensity_shows_where_it_expects_something(tmp_path: Path) -> None:
-    plain = missions.tracks("phd", 0, [1, 2, 3], [(0, 0), (5, 5), (9, 9)])
-    intensity = LocalIntensity(
-        source="phd", epoch=1, seq=0, sent=0, time=plain.time, space=plain.space, frame=plain.frame,
-        weights=np.array([0.9, 0.01, 1.3]), means=plain.means, covariances=plain.covariances,
-    )  # fmt: skip
-    record(tmp_path / "a.rrd", intensity)
-    (drawn,) = rows(tmp_path / "a.rrd", "/picture/local/phd")
-    assert drawn["Points2D:labels"] == ["0.90", "1.30"]
-    assert rows(tmp_path / "a.rrd", "/counts/local/phd")[0]["Scalars:scalars"] == [pytest.approx(2.21)]
 
 
 def test_the_frame_is_that_of_the_first_global_tracks(tmp_path: Path) -> None:
