@@ -210,6 +210,7 @@ def cluster(
     keys: Any = np.sort(i * count + j)
     gated = memoryview(keys)
     joins: list[tuple[int, int, float]] = []
+    apart: dict[int, set[int]] = {}  # clusters with a pair that is not gated: never to be joined
 
     def has(x: int, y: int) -> bool:
         key = min(x, y) * count + max(x, y)
@@ -224,9 +225,17 @@ def cluster(
             a, b = sorted((int(root[first]), int(root[second])))
             if a == b or bits[a] & bits[b] or (holds[a] and holds[b]):
                 continue
+            if b in apart.get(a, ()):
+                continue
             left, right = nodes.get(a, [a]), nodes.get(b, [b])
             if not all(has(x, y) for x in left for y in right if {x, y} != {first, second}):
+                apart.setdefault(a, set()).add(b)
+                apart.setdefault(b, set()).add(a)
                 continue
+            for other in apart.pop(b, ()):
+                apart[other].discard(b)
+                apart[other].add(a)
+                apart.setdefault(a, set()).add(other)
             root[right] = a
             nodes[a] = left + right
             nodes.pop(b, None)

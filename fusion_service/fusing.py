@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from fusion_service import linalg
 from fusion_service.association import by_size, uniform_ci
 from fusion_service.config import CentreConfig
-from fusion_service.densities import Mixtures
+from fusion_service.densities import Mixtures, reduce_mixtures
 from fusion_service.journal import Journal
 from fusion_service.lifecycle import Picture
 from fusion_service.rows import NO_TRACK, Rows
@@ -30,6 +30,11 @@ __all__ = ["fuse_all"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+
+
+MOST_PRODUCTS = 4096
+"""Components that a product of sources may have before it is reduced; theirs are reduced first to fit, and beyond
+twelve sources moments are fused."""
 
 
 def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, journal: Journal) -> tuple[Picture, Floats]:
@@ -93,6 +98,11 @@ def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtu
     sources = [rows.tracks.mixtures(members[several, j]) for j in range(members.shape[1])]
     if alone:
         return sources[0], several
+    fits = max(1, int(MOST_PRODUCTS ** (1 / len(sources)) + 1e-9))
+    if config.mixture_rule != "aa" and max(len(one.log_weights) for one in sources) > fits:
+        if fits == 1:
+            return None, np.zeros(len(members), dtype=np.bool_)
+        sources = [reduce_mixtures(one, max_components=fits) for one in sources]
     options = {**config.mixture_options, "max_components": config.max_components}
     by_existence = config.mixture_rule == "aa" and not config.mixture_options
     weights = _shares(rows, members[several]) if by_existence else None

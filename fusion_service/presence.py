@@ -27,6 +27,9 @@ Floats = NDArray[np.float64]
 MOST_CERTAIN = 0.999
 """No sensor is believed to see more surely than this."""
 
+MOST_OVERLAPPING = 32
+"""Beyond so many sources the overlap is not worked out, and existence is fused by the consistent rule."""
+
 
 def existence_now(rows: Rows, picture: Picture, fresh: NDArray[np.bool_], intake: Intake, time: int) -> Floats:
     """Existence (G,) of the picture's tracks at `time`, ns. fresh (G,): tracks with new data in this step."""
@@ -44,9 +47,9 @@ def existence_now(rows: Rows, picture: Picture, fresh: NDArray[np.bool_], intake
 
 def _fused(rows: Rows, members: NDArray[np.intp], method: str) -> Floats:
     r = rows.tracks.existence[members]
-    if method != "geometric":
-        return np.asarray(fuse_existence(r, method))
     k = members.shape[1]
+    if method != "geometric" or k > MOST_OVERLAPPING:
+        return np.asarray(fuse_existence(r, "consistent" if method == "geometric" else method))
     sources = [
         Mixtures(
             np.zeros((1, len(members))),

@@ -164,6 +164,18 @@ def test_an_average_weighs_each_source_by_the_existence_it_reports() -> None:
     same_density(published(step(made, 1).tracks), expected)
 
 
+@pytest.mark.parametrize("rule", ["aa", "gm-ga"])
+def test_many_sources_of_many_modes_are_fused_too(rule: str) -> None:
+    for count in (6, 14, 70):
+        names = [f"r{k:02}" for k in range(count)]
+        made = centre(names, mixture_rule=rule, existence="geometric")
+        for k, name in enumerate(names):
+            give(made, mixed(name, 1, some(1, 3, k), existence=np.array([0.8])))
+        picture = step(made, 1).tracks
+        assert picture.contributor_counts.max() > count / 2
+        assert (schemas.check_numbers([picture])[0] == 0).all()
+
+
 def run(shuffle: int | None, cut: int | None, **config: Any) -> list[bytes]:
     made = FusionCentre({"max_components": 6, "lateness": 3.0, **config})
     states = truth(6)
