@@ -1,7 +1,7 @@
 """The tables of the README: whole missions by `fusion-service demo`, one after the other.
 
 python -m benchmarks.missions                      three radars under each rule
-python -m benchmarks.missions --data DIR           Autoferry 2, 3, 5, 13, 16 as well
+python -m benchmarks.missions --data DIR           Autoferry 2, 3, 5, 13, 16 as well, without and with cameras
 """
 
 from __future__ import annotations
@@ -73,6 +73,37 @@ def autoferry(data: str, speed: float) -> None:
     print(f"| mean | {' | '.join(f'{value:.4g}' for value in means)} | {TO_BEAT['mean']} |")
 
 
+def cameras(data: str, speed: float) -> None:
+    print("\n| scenario | cameras | GOSPA, m | localisation | missed | false | ANEES | identity switches |")
+    print("|---|---|---|---|---|---|---|---|")
+    keys = ("gospa", "gospa_localisation", "gospa_missed", "gospa_false", "anees", "identity_switches")
+    for label, options in (("without", []), ("with", ["--cameras"])):
+        rows = []
+        for number in SCENARIOS:
+            arguments = ["--scenario", f"autoferry:{number}", "--data", data, "--rule", "hmd-ga", *options]
+            fused = demo(*arguments, speed=speed)["fused"]
+            rows.append([fused[key] for key in keys])
+            print(f"| {number} | {label} | {' | '.join(f'{value:.4g}' for value in rows[-1])} |", flush=True)
+        means = [sum(column) / len(rows) for column in zip(*rows, strict=True)]
+        print(f"| mean | {label} | {' | '.join(f'{value:.4g}' for value in means)} |", flush=True)
+
+
+def trackers(speed: float) -> None:
+    print("\n| radars publish | fused by | GOSPA, m | localisation, m2 | missed, m2 | false, m2 | RMSE, m | ANEES |")
+    print("|---|---|---|---|---|---|---|---|")
+    cases = (
+        ("Gaussians", "`ci`", ["--rule", "ci"]),
+        ("IMM mixtures", "`gm-ga`", ["--tracker", "imm", "--set", "mixture_rule=gm-ga"]),
+        ("IMM mixtures", "`ci` on moments", ["--tracker", "imm"]),
+        ("intensities", "`hybrid`", ["--tracker", "gm-phd"]),
+        ("intensities", "`aa`", ["--tracker", "gm-phd", "--set", "intensity_rule=aa"]),
+        ("intensities", "`ga`", ["--tracker", "gm-phd", "--set", "intensity_rule=ga"]),
+    )
+    for what, how, options in cases:
+        row = cells(how, demo(*options, speed=speed)["fused"])
+        print(f"| {what} {row}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", help="folder of the Autoferry recordings")
@@ -81,8 +112,10 @@ def main() -> None:
     args = parser.parse_args()
     if not args.only_autoferry:
         three_radars(args.speed)
+        trackers(args.speed)
     if args.data:
         autoferry(args.data, args.speed)
+        cameras(args.data, args.speed)
 
 
 if __name__ == "__main__":
