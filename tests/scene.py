@@ -121,6 +121,10 @@ class Scene:
     def last_status(self) -> Status:
         return self.seen.statuses[-1][1]
 
+    def said_of(self, source: str, what: str) -> object:
+        """What the newest status says of a source; None before it says anything."""
+        return self.last_status().sources.get(source, {}).get(what) if self.seen.statuses else None
+
 
 @contextmanager
 def opened(hub: Hub, folder: Path) -> Iterator[Scene]:

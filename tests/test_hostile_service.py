@@ -45,7 +45,7 @@ def test_a_token_that_is_no_name(scene: Scene) -> None:
     before = scene.seen.confirmed()
     scene.bus.announce("fusion/v1/local/radar 1/alive")
     scene.bus.announce(schemas.local_key("radar9", "alive"))
-    eventually(lambda: scene.last_status().sources.get("radar9", {}).get("alive"))
+    eventually(lambda: scene.said_of("radar9", "alive"))
     assert goes_on(scene, before)
     assert "radar 1" not in scene.last_status().sources
 
@@ -73,7 +73,7 @@ def test_a_sequence_that_jumps_to_the_end(scene: Scene) -> None:
     publisher = scene.bus.publisher(schemas.local_key("r2", "info"))
     for seq in (0, 2**64 - 1):
         publisher.put(info("r2", seq))
-    eventually(lambda: scene.last_status().sources.get("r2", {}).get("gaps", 0) > 2**60)
+    eventually(lambda: int(str(scene.said_of("r2", "gaps") or 0)) > 2**60)
     assert goes_on(scene, before)
 
 

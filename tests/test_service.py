@@ -32,10 +32,10 @@ def test_a_killed_sensor_is_told_within_a_second_and_others_keep_its_targets(sce
     before = scene.seen.confirmed()
     sensors[1].kill()
     killed = time.monotonic()
-    eventually(lambda: scene.last_status().sources["r2"]["alive"] is False)
+    eventually(lambda: scene.said_of("r2", "alive") is False)
     assert next(at for at, one in scene.seen.statuses if one.sources.get("r2", {}).get("alive") is False) - killed < 1.0
     count = len(scene.seen.pictures)
-    eventually(lambda: scene.last_status().sources["r2"]["stale"])
+    eventually(lambda: scene.said_of("r2", "stale"))
     eventually(lambda: scene.seen.feeders(before[2]) == {"r1", "r3"})
     eventually(lambda: len(scene.seen.pictures) > count + 5)
     assert scene.seen.confirmed() == before
@@ -126,7 +126,7 @@ def test_what_cannot_be_read_is_refused_by_reason_and_the_rest_goes_on(scene: Sc
     eventually(lambda: scene.last_status().refused == expected, 8)
     publisher.put(changed(seq=10))
     publisher.put(changed(seq=10))
-    eventually(lambda: scene.last_status().sources["bad"]["repeats"] == 1)
+    eventually(lambda: scene.said_of("bad", "repeats") == 1)
     assert scene.seen.sees(0, 1)()
     assert {entry.reason for log in scene.seen.logs for entry in log.refused} == {*expected, "repeat"}
 
