@@ -21,13 +21,13 @@ from fusion_service.checkpoint import pack_state, unpack_state
 from fusion_service.config import CentreConfig, centre_config, config_hash
 from fusion_service.densities import Mixtures
 from fusion_service.fusing import fuse_all
+from fusion_service.health import step_status
 from fusion_service.intake import Event, Intake, Order, Refused, SourceFound, SourceLost
 from fusion_service.journal import Journal
 from fusion_service.lifecycle import Picture, advance, empty_picture
 from fusion_service.linking import Linker
 from fusion_service.presence import existence_now
 from fusion_service.rows import Rows, predict_tracks, usable_rows, write_back
-from fusion_service.sources import Source
 from schemas import ORIGINS, GlobalTracks, Local, Status, StepLog
 from schemas import messages as words
 
@@ -113,7 +113,8 @@ class FusionCentre:
         tracks = self._publish(rows, influence, names)
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
-        return StepResult(tracks, log, self._status(time))
+        status = step_status(self._intake, journal, log, self._numbers(), self.refusals())
+        return StepResult(tracks, log, status)
 
     def refusals(self) -> dict[str, int]:
         """Refusals by reason since the start, those included that no step has told yet."""
@@ -230,39 +231,9 @@ class FusionCentre:
             split_from=self._journal.splits(),
         )
 
-    def _status(self, time: int) -> Status:
+    def _numbers(self) -> dict[str, int]:
         kinds = Counter(self._picture.status.tolist())
-        return Status(
-            source=self.config.name,
-            epoch=self.epoch,
-            seq=self._published - 1,
-            sent=time,
-            time=time,
-            step=self._step,
-            uptime=0.0,
-            rates={},
-            queue={"pending": self._intake.pending()},
-            refused=self.refusals(),
-            dropped=dict(sorted(self._journal.dropped.items())),
-            sources={name: self._health(source, time) for name, source in sorted(self._intake.sources.items())},
-            tracks={name: kinds.get(code, 0) for code, name in enumerate(words.STATUSES)},
-            step_time={},
-        )
-
-    def _health(self, source: Source, time: int) -> dict[str, Any]:
-        return {
-            "epoch": max(source.epoch, 0),
-            "alive": source.alive,
-            "stale": self._intake.is_stale(source, time),
-            "muted": source.muted,
-            "last": source.last,
-            "offset": source.offset / 1e9,
-            "messages": source.messages,
-            "repeats": source.repeats,
-            "gaps": source.gaps,
-            "reordered": source.reordered,
-            "tracks": len(source.tracks.id),
-        }
+        return {name: kinds.get(code, 0) for code, name in enumerate(words.STATUSES)}
 
 
 def _densities(picture: Picture, publish: str) -> dict[str, Any]:

@@ -153,6 +153,8 @@ def _record(args: argparse.Namespace, stop: threading.Event) -> None:
 
     path = Path(args.out) if args.out else default_path()
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists():
+        raise FileExistsError(f"{path} exists already: name another file, or move it away")
     with open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop) as bus:
         run_recorder(bus, path, realm=args.realm, stop=stop, cutoff=args.cutoff)
 

@@ -80,6 +80,7 @@ def _choice(*known: str) -> Callable[[Any], str]:
             raise ValueError(f"is {value!r}, must be one of: {', '.join(known)}")
         return str(value)
 
+    read.__doc__ = " | ".join(known)
     return read
 
 
@@ -287,7 +288,9 @@ def load_config(path: str | Path) -> ServiceConfig:
     known = {one.name: one for one in fields(ServiceConfig)}
     for name in raw:
         if name not in known:
-            problems.append(((name,), f"unknown table (known: {', '.join(known)})"))
+            homes = [table for table in known if hasattr(getattr(ServiceConfig(), table), name)]
+            where = f": put it under [{homes[0]}]" if homes else f" (known: {', '.join(known)})"
+            problems.append(((name,), f"unknown table{where}"))
     config = ServiceConfig(
         centre=_read_centre(raw.get("centre", {}), ("centre",), problems),
         bus=_read(BusConfig, raw.get("bus", {}), ("bus",), problems),
@@ -417,7 +420,8 @@ def example_toml() -> str:
                 continue
             value = getattr(table, one.name)
             text = f"{one.name} = {toml_value(value)}" if value is not None else f"# {one.name} ="
-            lines.append(f"{text:<44} # {one.metadata['help']}")
+            known = one.metadata["read"].__doc__ or ""
+            lines.append(f"{text:<44} # {one.metadata['help']}{f' ({known})' if '|' in known else ''}")
         lines.append("")
     lines += [
         "# [centre.sources.radar1]                  # any key of source_defaults for one source",

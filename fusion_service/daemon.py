@@ -236,11 +236,12 @@ class Service:
             if self._message_clock is not None:
                 self._message_clock.presence(name, alive)
         self._seen_tokens = tokens
-        if changed and len(changed) <= 5 and self._allowed("tokens", 0.2):
-            for name, alive in changed.items():
+        for name, alive in changed.items():
+            if self._allowed(f"tokens {self._counts['tokens'] % 20}", 1.0):  # twenty lines a second
                 log.info("source %s is %s", name, "there" if alive else "gone")
-        elif changed and self._allowed("many tokens", 1.0):
-            log.info("sources coming and going: %d changed, %d there", len(changed), sum(tokens.values()))
+                self._counts["tokens"] += 1
+            elif self._allowed("many tokens", 1.0):
+                log.info("many sources come and go: %d there", sum(tokens.values()))
         return bool(changed)
 
     def _allowed(self, what: str, interval: float) -> bool:

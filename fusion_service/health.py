@@ -28,13 +28,13 @@ def step_status(
         queue={"pending": intake.pending()},
         refused=refused,
         dropped=dict(sorted(journal.dropped.items())),
-        sources={name: _health(source, intake, log.time) for name, source in sorted(intake.sources.items())},
+        sources={name: _health(source, intake, journal, log.time) for name, source in sorted(intake.sources.items())},
         tracks=tracks,
         step_time={},
     )
 
 
-def _health(source: Source, intake: Intake, time: int) -> dict[str, Any]:
+def _health(source: Source, intake: Intake, journal: Journal, time: int) -> dict[str, Any]:
     return {
         "epoch": max(source.epoch, 0),
         "alive": source.alive,
@@ -47,4 +47,5 @@ def _health(source: Source, intake: Intake, time: int) -> dict[str, Any]:
         "gaps": source.gaps,
         "reordered": source.reordered,
         "tracks": len(source.tracks.id),
+        "refused": dict(sorted(journal.refused_of.get(source.name, {}).items())),
     }

@@ -29,6 +29,7 @@ class Journal:
         self._name, self._config_hash, self._version = name, config_hash, version
         self.refused: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self.refused_of: dict[str, Counter[str]] = {}
         self.broken: dict[int, int] = {}
         self._events: list[dict[str, Any]] = []
         self._begin()
@@ -60,6 +61,8 @@ class Journal:
     def refuse(self, entry: Entry) -> None:
         """A message, or `count` of its tracks, not used."""
         self.refused[entry.reason] += max(entry.count, 1)
+        if entry.source in self.refused_of or len(self.refused_of) < MOST_ENTRIES:
+            self.refused_of.setdefault(entry.source, Counter())[entry.reason] += max(entry.count, 1)
         self._refused.append(entry)
 
     def drop(self, entry: Entry) -> None:

@@ -145,6 +145,13 @@ def test_every_other_rule_can_be_chosen_in_four_and_in_nine_dimensions() -> None
             assert centre_config({"rule": rule, "space": space}).rule == rule
 
 
+def test_a_key_outside_its_table_is_told_where_it_belongs(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path, 'rule = "ci"\nrealm = "x"\n')
+    assert "put it under [centre]" in caught.value.problems[0]
+    assert "put it under [bus]" in caught.value.problems[1]
+
+
 def test_not_toml_and_not_there(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"not TOML: .*line 2"):
         load(tmp_path, "[centre]\nrule = = 1\n")
