@@ -19,16 +19,16 @@ from numpy.typing import NDArray
 
 from fusion_service.checkpoint import pack_state, unpack_state
 from fusion_service.config import CentreConfig, centre_config, config_hash
-from fusion_service.densities import Mixtures
 from fusion_service.fusing import fuse_all
 from fusion_service.health import step_status
 from fusion_service.intake import Event, Intake, Order, Refused, SourceFound, SourceLost
 from fusion_service.journal import Journal
-from fusion_service.lifecycle import Picture, advance, empty_picture
+from fusion_service.lifecycle import Picture, empty_picture
 from fusion_service.linking import Linker
 from fusion_service.presence import existence_now
+from fusion_service.publishing import Contributions, live_on, picture_message
 from fusion_service.rows import Rows, predict_tracks, usable_rows, write_back
-from schemas import ORIGINS, GlobalTracks, Local, Status, StepLog
+from schemas import GlobalTracks, Status, StepLog
 from schemas import messages as words
 
 __all__ = ["FusionCentre", "Order", "Refused", "SourceFound", "SourceLost", "StepResult"]
@@ -110,7 +110,7 @@ class FusionCentre:
         self._picture, influence = fuse_all(rows, self._predicted(time), time, self.config, journal)
         self._live(rows, time)
         write_back(rows, self._intake)
-        tracks = self._publish(rows, influence, names)
+        tracks = self._publish(rows, influence)
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         status = step_status(self._intake, journal, log, self._numbers(), self.refusals())
@@ -188,65 +188,31 @@ class FusionCentre:
         np.maximum.at(newest, at, tracks.time[linked])
         fresh = newest > picture.seen
         existence = existence_now(rows, picture, fresh, self._intake, time)
-        before = picture.status
         seen = np.maximum(picture.seen, newest)
         picture = replace(picture, updated=updated, existence=existence, seen=seen)
-        picture, ended = advance(picture, time, support, fresh, self.config)
-        for track in picture.id[ended].tolist():
-            self._journal.end(track, "lost", None)
-        for status, decision in ((words.CONFIRMED, words.CONFIRMED_NOW), (words.COASTING, words.COASTING_NOW)):
-            self._journal.tracks(decision, picture.id[(picture.status == status) & (before != status) & ~ended])
+        picture, ended = live_on(picture, time, support, fresh, self.config, self._journal)
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
         self._picture = picture.take(~ended)
 
-    def _publish(self, rows: Rows, influence: NDArray[np.float64], names: tuple[str, ...]) -> GlobalTracks:
+    def _publish(self, rows: Rows, influence: NDArray[np.float64]) -> GlobalTracks:
         picture, tracks, linked = self._picture, rows.tracks, rows.linked()
         linked = linked[np.argsort(tracks.link[linked], kind="stable")]
         counts = np.bincount(picture.find(tracks.link[linked]), minlength=len(picture.id))
-        origins = {source.origin for source in self._intake.sources.values() if source.messages}
-        return GlobalTracks(
-            source=self.config.name,
+        contributions = Contributions(
+            counts, rows.source[linked], rows.epoch[linked], tracks.id[linked], influence[linked]
+        )
+        return picture_message(
+            picture,
+            self._intake,
+            self._journal,
+            contributions,
             epoch=self.epoch,
             seq=self._published,
-            sent=self._time,
-            origin=max(origins, key=ORIGINS.index, default="live"),
-            lineage=(*(name for name in names if name != self.config.name), self.config.name),
-            time=self._time,
             step=self._step,
+            time=self._time,
             rule=self.config.rule,
-            space=self.config.space,
-            frame=self._intake.frame or Local("none"),
-            ids=picture.id,
-            status=picture.status,
-            existence=picture.existence,
-            **_densities(picture, self.config.publish),
-            updated=picture.updated,
-            sources=names,
-            contributor_counts=counts.astype(np.uint16),
-            contributor_source=rows.source[linked].astype(np.uint16),
-            contributor_epoch=rows.epoch[linked],
-            contributor_id=tracks.id[linked],
-            contributor_influence=influence[linked],
-            ended=self._journal.ended(),
-            split_from=self._journal.splits(),
         )
 
     def _numbers(self) -> dict[str, int]:
         kinds = Counter(self._picture.status.tolist())
         return {name: kinds.get(code, 0) for code, name in enumerate(words.STATUSES)}
-
-
-def _densities(picture: Picture, publish: str) -> dict[str, Any]:
-    """The columns of a message: mixtures as they are, as their moments, or by their heaviest component."""
-    mean, covariance = picture.mean, picture.covariance
-    if len(picture.log_weight) and publish == "mixture":
-        parts = Mixtures(picture.log_weight, picture.part_mean, picture.part_covariance)
-        weights, means, covariances, counts = parts.rows()
-        return {"means": means, "covariances": covariances, "weights": weights, "counts": counts}
-    if len(picture.log_weight) and publish == "mode":
-        heaviest, each = picture.log_weight.argmax(axis=0), np.arange(len(picture.id))
-        mean, covariance = picture.part_mean[:, heaviest, each], picture.part_covariance[:, :, heaviest, each]
-    return {
-        "means": np.ascontiguousarray(mean.T),
-        "covariances": np.ascontiguousarray(np.moveaxis(covariance, 2, 0)),
-    }

@@ -32,10 +32,11 @@ from fusion_service.densities import Mixture
 from fusion_service.health import step_status
 from fusion_service.intake import Event, Intake, Order
 from fusion_service.journal import Journal
-from fusion_service.lifecycle import Picture, advance, empty_picture, newborn
+from fusion_service.lifecycle import Picture, empty_picture, newborn
 from fusion_service.motion import predict
+from fusion_service.publishing import Contributions, live_on, picture_message
 from fusion_service.rows import Rows, usable_rows
-from schemas import ORIGINS, Entry, GlobalTracks, Local
+from schemas import Entry, GlobalTracks
 from schemas import messages as words
 
 __all__ = ["IntensityCentre"]
@@ -251,45 +252,31 @@ class IntensityCentre:
         """The picture after one step of life, without what ended, and which did. supporting (N, G)."""
         last = np.array([self._intake.sources[name].last for name in names], dtype=np.int64)
         newest = np.max(np.where(supporting, last[:, None], -1), axis=0, initial=-1)
-        before, journal = picture.status, self._journal
         fresh = newest > picture.seen
         seen, updated = np.maximum(picture.seen, newest), np.maximum(picture.updated, newest)
         picture = replace(picture, seen=seen, updated=updated)
-        picture, ended = advance(picture, time, supporting.sum(axis=0), fresh, self.config)
-        for track in picture.id[ended].tolist():
-            journal.end(track, "lost", None)
-        for status, decision in ((words.CONFIRMED, words.CONFIRMED_NOW), (words.COASTING, words.COASTING_NOW)):
-            journal.tracks(decision, picture.id[(picture.status == status) & (before != status) & ~ended])
+        picture, ended = live_on(picture, time, supporting.sum(axis=0), fresh, self.config, self._journal)
         return picture.take(~ended), ended
 
     def _publish(self, share: Floats, names: tuple[str, ...]) -> GlobalTracks:
         picture, sources = self._picture, self._intake.sources
         owner, source = np.nonzero(share.T > 0)
-        origins = {one.origin for one in sources.values() if one.messages}
         epochs = np.array([max(sources[name].epoch, 0) for name in names], dtype=np.uint64)
-        return GlobalTracks(
-            source=self.config.name,
+        contributions = Contributions(
+            counts=np.bincount(owner, minlength=len(picture.id)),
+            source=source,
+            epoch=epochs[source],
+            id=np.zeros(len(source), dtype=np.uint64),
+            influence=share.T[owner, source],
+        )
+        return picture_message(
+            picture,
+            self._intake,
+            self._journal,
+            contributions,
             epoch=self.epoch,
             seq=self._published,
-            sent=self._time,
-            origin=max(origins, key=ORIGINS.index, default="live"),
-            lineage=(*(name for name in names if name != self.config.name), self.config.name),
-            time=self._time,
             step=self._step,
+            time=self._time,
             rule=self.config.intensity_rule,
-            space=self.config.space,
-            frame=self._intake.frame or Local("none"),
-            ids=picture.id,
-            status=picture.status,
-            existence=picture.existence,
-            means=np.ascontiguousarray(picture.mean.T),
-            covariances=np.ascontiguousarray(np.moveaxis(picture.covariance, 2, 0)),
-            updated=picture.updated,
-            sources=names,
-            contributor_counts=np.bincount(owner, minlength=len(picture.id)).astype(np.uint16),
-            contributor_source=source.astype(np.uint16),
-            contributor_epoch=epochs[source],
-            contributor_id=np.zeros(len(source), dtype=np.uint64),
-            contributor_influence=share.T[owner, source],
-            ended=self._journal.ended(),
         )
