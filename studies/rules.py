@@ -1,0 +1,89 @@
+"""Fusion rules as studies name them: `ci`, `ci:criterion=trace`, `bci:max_correlation=0.5`, `my_rule.py:fuse`.
+
+A rule of your own is a function in a Python file, called with the batch last, as `fusion_service.rules.fuse_last`:
+means (N, n, B), covariances (N, n, n, B) -> mean (n, B), covariance (n, n, B).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.rules import RULES, RuleError, fuse_last
+from fusion_service.rules.face import Fused
+
+__all__ = ["Fuser", "fuser"]
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Fuser:
+    """A rule with its options; `weights`: "uniform", or None to let the rule choose. `function`: one of your own."""
+
+    label: str
+    rule: str = ""
+    options: tuple[tuple[str, Any], ...] = ()
+    weights: str | None = None
+    function: Callable[[Floats, Floats], tuple[Floats, Floats]] | None = None
+
+    def __call__(self, means: Floats, covariances: Floats) -> Fused:
+        """Fuse means (N, n, B) and covariances (N, n, n, B): mean (n, B), covariance (n, n, B), weights (N, B)."""
+        if self.function is not None:
+            mean, covariance = self.function(means, covariances)
+            return Fused(mean, covariance, np.full(means[:, 0].shape, np.nan), None)
+        N, _, B = means.shape
+        weights = np.full((N, B), 1.0 / N) if self.weights == "uniform" else None
+        return fuse_last(self.rule, means, covariances, weights, **dict(self.options))
+
+
+def fuser(text: str) -> Fuser:
+    """The rule that `text` names; ValueError of one line for what is no rule."""
+    name, _, rest = text.partition(":")
+    if name.endswith(".py"):
+        return _own(Path(name), rest)
+    if name not in RULES:
+        raise ValueError(f"unknown rule {name!r}: one of {', '.join(RULES)}, or FILE.py:FUNCTION")
+    options: dict[str, Any] = {}
+    for part in filter(None, rest.split(",")):
+        key, equals, value = part.partition("=")
+        if not equals or (key not in RULES[name].options and key != "weights"):
+            known = ", ".join([*RULES[name].options, "weights"])
+            raise ValueError(f"rule {text!r}: {part!r} is not KEY=VALUE with one of {known}")
+        options[key] = _value(value)
+    weights = options.pop("weights", None)
+    one = Fuser(text, name, tuple(options.items()), weights)
+    try:
+        one(np.zeros((2, 2, 1)), np.stack([np.eye(2)[..., None]] * 2))
+    except RuleError as error:
+        raise ValueError(f"rule {text!r}: {error}") from None
+    return one
+
+
+def _value(text: str) -> Any:
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _own(path: Path, name: str) -> Fuser:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    if spec is None or spec.loader is None or not path.is_file():
+        raise ValueError(f"no file {path} to take a rule from")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    function = getattr(module, name, None)
+    if not callable(function):
+        raise ValueError(f"{path} has no function {name!r}: write {path}:FUNCTION")
+    return Fuser(f"{path.stem}.{name}", function=function)
