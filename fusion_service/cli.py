@@ -1,4 +1,7 @@
-"""`fusion-service`: hub, run, record, demo, check, rules. Exit codes: 0 done, 1 failure, 2 bad usage or config."""
+"""`fusion-service`: hub, run, record, demo, check, rules, and what works on recordings.
+
+Exit codes: 0 done, 1 failure, 2 bad usage or config.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import threading
 from collections.abc import Sequence
 from pathlib import Path
 
+from fusion_service.commands import COMMANDS
 from fusion_service.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.process import set_up_logging, stop_on_signals
 
@@ -123,6 +127,11 @@ def _parser() -> argparse.ArgumentParser:
     check.add_argument("config", nargs="?", metavar="FILE", help="TOML file")
 
     command("rules", "The fusion rules and what each promises.", "fusion-service rules")
+
+    for module in COMMANDS:
+        sub = command(module.__name__.rpartition(".")[2].replace("_", "-"), module.HELP, module.EXAMPLE)
+        module.add(sub)
+        sub.set_defaults(call=module.run)
     return parser
 
 
@@ -200,7 +209,7 @@ def _rules(args: argparse.Namespace, stop: threading.Event) -> None:
         print(f"{'':<18}options: {options}; source: {rule.source}")
 
 
-COMMANDS = {"hub": _hub, "run": _run, "record": _record, "demo": _demo, "check": _check, "rules": _rules}
+HERE = {"hub": _hub, "run": _run, "record": _record, "demo": _demo, "check": _check, "rules": _rules}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -218,16 +227,17 @@ def _call(args: argparse.Namespace, stop: threading.Event) -> int:
     from fusion_service.bus import BusError, BusStopped  # slow to import: only now is a signal heard
     from fusion_service.config import ConfigError
     from fusion_service.demo import DemoError
+    from fusion_service.errors import ReviewError
     from fusion_service.state import StateError
 
     try:
-        COMMANDS[args.command](args, stop)
+        (HERE.get(args.command) or args.call)(args, stop)
     except BusStopped:
         return 0
     except ConfigError as error:
         print("\n".join(error.problems), file=sys.stderr)
         return 2
-    except (BusError, DemoError, StateError, OSError) as error:
+    except (BusError, DemoError, ReviewError, StateError, OSError) as error:
         print(f"fusion-service {args.command}: {error}", file=sys.stderr)
         return 1
     return 0

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fusion_service.errors import ReviewError
 from fusion_service.recording.columns import import_rerun
 from schemas import Message, MessageError, decode
 
@@ -46,7 +47,7 @@ def read(path: str | Path) -> Iterator[RawMessage]:
     """Every recorded message in the order of arrival, decodable or not.
 
     Reads as it goes: what is held is the part of the file that is not yet in order, about one flush interval.
-    Raises `FileNotFoundError`, and `ValueError` for a file that is no recording.
+    Raises `FileNotFoundError`, and `ReviewError` for a file that is no recording.
     """
     path = Path(path)
     if not path.is_file():
@@ -96,7 +97,7 @@ def _open_whole(path: Path, folder: Path) -> Any:
 
 def repair(path: str | Path) -> int:
     """Cut a torn recording, in place, after its last whole record, so that viewers open it. Returns the bytes cut,
-    0 for a file that opens. `ValueError` for a file that is no recording."""
+    0 for a file that opens. `ReviewError` for a file that is no recording."""
     path = Path(path)
     try:
         _open(path)
@@ -108,7 +109,7 @@ def repair(path: str | Path) -> int:
         return size - path.stat().st_size
 
 
-class _TornError(ValueError):
+class _TornError(Exception):
     """A recording that ends within a record."""
 
 
@@ -126,7 +127,7 @@ def _open(path: Path) -> Any:
         except RuntimeError as error:
             if 0 < _whole(path) < path.stat().st_size:
                 raise _TornError(f"{path} is torn ({error})") from None
-    raise ValueError(f"{path} is not a recording")
+    raise ReviewError(f"{path} is not a recording")
 
 
 def _whole(path: Path) -> int:
