@@ -17,7 +17,7 @@ from typing import Any
 from fusion_service.bus import DEFAULT_ENDPOINT, BusError, BusStopped
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
-from sensor_clients.playback import autoferry
+from sensor_clients.playback import autoferry, table
 from sensor_clients.publisher import TrackPublisher, TruthPublisher
 from sensor_clients.runner import pace
 from sensor_clients.scenarios.three_radars import TRACKERS, three_radars
@@ -31,6 +31,7 @@ EXAMPLES = """examples:
   sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
   sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
+  sensor-client playback tracks.csv --sensor radar1        what `fusion-service export` has written
 """
 
 
@@ -67,8 +68,9 @@ def _parser() -> argparse.ArgumentParser:
     simulate.add_argument("--seed", type=_whole, default=0, help="seed of noise and clutter (default 0)")
     simulate.add_argument("--tracker", choices=TRACKERS, default="ckf", help="of the radars (default ckf); see list")
     simulate.set_defaults(run=_simulate)
-    playback = _command(commands, "playback", "play recorded returns through a local tracker", EXAMPLES)
-    playback.add_argument("scenario", help="autoferry:N, N one of " + ", ".join(map(str, autoferry.SCENARIOS)))
+    playback = _command(commands, "playback", "play recorded returns through a local tracker, or tracks", EXAMPLES)
+    numbers = ", ".join(map(str, autoferry.SCENARIOS))
+    playback.add_argument("scenario", help=f"autoferry:N, N one of {numbers}; or a .csv or .parquet file of tracks")
     playback.add_argument("--data", type=Path, help="directory of the scenario files (default: $FUSION_DATA)")
     playback.set_defaults(run=_playback)
     for command in (simulate, playback):
@@ -133,17 +135,20 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
 
 def _playback(arguments: argparse.Namespace) -> int:
+    path = Path(arguments.scenario)
+    if path.suffix in table.SUFFIXES:
+        return _publish(table.load(path), arguments, 0, table.lineage(path, arguments.sensor))
     name, _, number = arguments.scenario.partition(":")
     if name != "autoferry" or number not in map(str, autoferry.SCENARIOS):
         known = ", ".join(f"autoferry:{n}" for n in autoferry.SCENARIOS)
-        raise UsageError(f"no recorded scenario {arguments.scenario!r}; known: {known}")
+        raise UsageError(f"no recorded scenario {arguments.scenario!r}; known: {known}, or a .csv or .parquet file")
     data = arguments.data or os.environ.get("FUSION_DATA")
     if not data:
         raise UsageError("no data: say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")
     return _publish(autoferry.load(Path(data), int(number)), arguments, 0)
 
 
-def _publish(scenario: Scenario, arguments: argparse.Namespace, seed: int) -> int:
+def _publish(scenario: Scenario, arguments: argparse.Namespace, seed: int, lineage: Sequence[str] | None = None) -> int:
     sensor = arguments.sensor
     if sensor != "truth" and sensor not in scenario.sensors:
         raise UsageError(f"no sensor {sensor!r} in {scenario.name}; known: {', '.join(scenario.sensors)}, truth")
@@ -161,6 +166,8 @@ def _publish(scenario: Scenario, arguments: argparse.Namespace, seed: int) -> in
         end = scenario.start + round(arguments.duration * 1e9)
         events = itertools.takewhile(lambda event: event.time <= end, events)
     where = {"connect": arguments.connect, "realm": arguments.realm, "origin": scenario.origin}
+    if kind is TrackPublisher:
+        where["lineage"] = lineage
     with _stopped_by_signals() as stop, suppress(BusStopped), kind(name, stop=stop, **where) as publisher:
         start_at = time.time() if arguments.start_at is None else arguments.start_at
         pace(events, publisher, start=scenario.start, start_at=start_at, speed=arguments.speed, stop=stop)
