@@ -8,13 +8,20 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from fusion_service import linalg
 
-__all__ = ["Gospa", "gospa", "identity_switches", "nees", "nees_bounds", "ospa"]
+__all__ = ["Gospa", "assign", "gospa", "identity_switches", "nees", "nees_bounds", "ospa"]
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.intp]
+
+DENSE = 2500
+"""Pairs up to which all of them are assigned at once."""
 
 
 class Gospa(NamedTuple):
@@ -38,17 +45,57 @@ def gospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0, alpha: flo
     the |M - T| left over cost c^p / alpha each, and a pair that is c or more apart c^p / 2 on either side.
     """
     objects, tracks = len(truth), len(estimates)
-    gap = truth[:, None, :] - estimates[None, :, :]
-    distance = np.sqrt((gap * gap).sum(axis=-1))
-    rows, columns = linear_sum_assignment(np.minimum(distance, c) ** p)
-    close = distance[rows, columns] < c
+    rows, columns, distance = assign(truth, estimates, c, p)
     assignment = np.full(objects, -1)
-    assignment[rows[close]] = columns[close]
-    localisation = float((distance[rows[close], columns[close]] ** p).sum())
-    apart = int((~close).sum())
+    assignment[rows] = columns
+    localisation = float((distance**p).sum())
+    apart = min(objects, tracks) - len(rows)
     missed = c**p * (apart / 2 + max(objects - tracks, 0) / alpha)
     false = c**p * (apart / 2 + max(tracks - objects, 0) / alpha)
     return Gospa((localisation + missed + false) ** (1 / p), localisation, missed, false, assignment)
+
+
+def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[Indices, Indices, Floats]:
+    """The assignment of (T, d) to (M, d) that both metrics use: rows and columns (K,) of its pairs closer than c, by
+    row, and their distances (K,).
+
+    It minimises the sum of min(distance, c)^p over min(T, M) pairs, which is to maximise the sum of c^p - distance^p
+    over pairs closer than c: these alone are looked at, and each connected part of them is an assignment of its own.
+    """
+    if len(truth) * len(estimates) <= DENSE:
+        gap = truth[:, None, :] - estimates[None, :, :]
+        distance = np.sqrt((gap * gap).sum(axis=-1))
+        rows, columns = linear_sum_assignment(np.minimum(distance, c) ** p)
+        close = distance[rows, columns] < c
+        rows, columns = rows[close], columns[close]
+        return rows, columns, distance[rows, columns]
+    tree = cKDTree(estimates)
+    near = tree.query_ball_point(truth, c)
+    i = np.repeat(np.arange(len(truth)), [len(one) for one in near])
+    j = np.array([column for one in near for column in one], dtype=np.intp)
+    gap = truth[i] - estimates[j]
+    d = np.sqrt((gap * gap).sum(axis=-1))
+    i, j, d = i[d < c], j[d < c], d[d < c]
+    nodes = len(truth) + len(estimates)
+    _, part = connected_components(coo_array((np.ones(len(i)), (i, len(truth) + j)), (nodes, nodes)), directed=False)
+    order = np.lexsort((j, i, part[i]))
+    i, j, d = i[order], j[order], d[order]
+    begins = np.flatnonzero(np.diff(part[i], prepend=-1))
+    ends = np.append(begins[1:], len(i))
+    alone = ends - begins == 1
+    chosen = [begins[alone]]
+    for begin, end in zip(begins[~alone], ends[~alone], strict=True):
+        some, row = np.unique(i[begin:end], return_inverse=True)
+        others, column = np.unique(j[begin:end], return_inverse=True)
+        cost = np.zeros((len(some), len(others)))
+        cost[row, column] = d[begin:end] ** p - c**p
+        pair = np.full(cost.shape, -1)
+        pair[row, column] = np.arange(begin, end)
+        found = pair[linear_sum_assignment(cost)]
+        chosen.append(found[found >= 0])
+    kept = np.sort(np.concatenate(chosen))
+    kept = kept[np.argsort(i[kept], kind="stable")]
+    return i[kept], j[kept], d[kept]
 
 
 def ospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> float:

@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from fusion_service import metrics
 from fusion_service.metrics import gospa, identity_switches, nees, nees_bounds, ospa
 
 Array = NDArray[np.float64]
@@ -113,3 +114,20 @@ def test_identity_switches_by_hand() -> None:
     times = [{1: "a", 2: "b"}, {1: "a"}, {1: "b", 2: "a"}, {2: "b"}, {}, {1: "b", 2: "b", 3: "c"}]
     assert identity_switches(times) == 3, "object 1: a a b . . b once; object 2: b . a b . b twice; object 3: none"
     assert identity_switches([]) == 0
+
+
+@pytest.mark.parametrize("spread", [30.0, 300.0, 3000.0])
+@pytest.mark.parametrize("alpha", [1.0, 2.0])
+def test_many_tracks_are_assigned_as_few_are(spread: float, alpha: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only pairs within the cut-off, part by part: the same distance as one dense assignment of all of them."""
+    rng = np.random.default_rng(8)
+    for _ in range(5):
+        truth = rng.uniform(0, spread, size=(rng.integers(60, 90), 2))
+        some = truth[rng.random(len(truth)) < 0.8] + rng.normal(scale=3, size=2)
+        estimates = rng.permutation(np.concatenate([some, rng.uniform(0, spread, size=(rng.integers(0, 40), 2))]))
+        sparse = metrics.gospa(truth, estimates, 15.0, alpha=alpha)
+        monkeypatch.setattr(metrics, "DENSE", 10**9)
+        dense = metrics.gospa(truth, estimates, 15.0, alpha=alpha)
+        monkeypatch.undo()
+        assert sparse[:4] == pytest.approx(dense[:4])
+        assert (sparse.assignment == dense.assignment).all()
