@@ -4,7 +4,7 @@ filters of one target (Bernoulli) or of one site of many (PHD) with one Gaussian
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -25,8 +25,10 @@ __all__ = [
     "Slopes",
     "aspects",
     "bisect",
+    "equal_divergence",
     "example",
     "gaussian_slopes",
+    "network",
     "newton",
     "overlap",
     "percent",
@@ -40,6 +42,9 @@ Indices = NDArray[np.intp]
 Slopes = Callable[[Floats, Indices], tuple[Floats, Floats]]
 """Weights w (b,) of the second source, for the problems at an index (b,): d log z / dw and d2 log z / dw2, (b,)."""
 
+SURVIVAL, BIRTH, DETECTION, CLUTTER, HALF, WALK, ORIGIN = 0.98, 0.02, 0.7, 2.0, 20.0, 0.05, 8.0
+"""Of the filters: probabilities of survival, birth and detection, false reports a scan, half the side of the square
+they lie in, variance of the walk a step, sigma of the birth density."""
 FIRST_MEAN, SECOND_MEAN = np.array([0.25, 0.25]), np.array([-0.75, -0.25])
 """m_i and m_j of Uney's example 3.3."""
 
@@ -123,19 +128,28 @@ def newton(slopes: Slopes, start: Floats, tolerance: float = 1e-4, clamp: bool =
     return Search(w, updates, settled)
 
 
-def bisect(means: Floats, covariances: Floats) -> Floats:
-    """The weight (B,) of the second Gaussian at equal divergence, by 50 halvings of KL(f_w||f_i) - KL(f_w||f_j)."""
+def bisect(lower: Callable[[Floats], NDArray[np.bool_]], size: int) -> Floats:
+    """The weight (B,) in [0, 1], by 50 halvings; lower(w) says where (B,) w is still too small."""
+    low, high = np.zeros(size), np.ones(size)
+    for _ in range(50):
+        w = 0.5 * (low + high)
+        small = lower(w)
+        low, high = np.where(small, w, low), np.where(small, high, w)
+    return 0.5 * (low + high)
+
+
+def equal_divergence(means: Floats, covariances: Floats) -> Floats:
+    """The weight (B,) of the second Gaussian at which KL(f_w || f_i) = KL(f_w || f_j), by bisection (Uney (7))."""
     A = linalg.inverse(covariances.transpose(1, 2, 0, 3))
     x = means - means[:1]
     y = linalg.matvec(A, x.swapaxes(0, 1))
-    low, high = np.zeros(means.shape[-1]), np.ones(means.shape[-1])
-    for _ in range(50):
-        w = 0.5 * (low + high)
+
+    def lower(w: Floats) -> NDArray[np.bool_]:
         C = linalg.inverse((1.0 - w) * A[:, :, 0] + w * A[:, :, 1])
         m = linalg.matvec(C, (1.0 - w) * y[:, 0] + w * y[:, 1])
-        more = kl_gaussians(m, C, x[0], covariances[0]) < kl_gaussians(m, C, x[1], covariances[1])
-        low, high = np.where(more, w, low), np.where(more, high, w)
-    return 0.5 * (low + high)
+        return np.asarray(kl_gaussians(m, C, x[0], covariances[0]) < kl_gaussians(m, C, x[1], covariances[1]))
+
+    return bisect(lower, means.shape[-1])
 
 
 class Local(NamedTuple):
@@ -154,7 +168,13 @@ class Reports(NamedTuple):
 
 
 def report(
-    rng: np.random.Generator, truth: Floats, there: Floats, R: Floats, detection: float, clutter: float, half: float
+    rng: np.random.Generator,
+    truth: Floats,
+    there: NDArray[np.bool_],
+    R: Floats,
+    detection: float,
+    clutter: float,
+    half: float,
 ) -> Reports:
     """One scan of position sensors: the target at truth (2, B), where `there` (B,), with noise R (2, 2, B); and a
     Poisson number (mean `clutter`) of false reports, uniform in the square of +-half about the origin."""
@@ -165,7 +185,7 @@ def report(
     L, d = linalg.ldl(R)
     position[:, 0] = truth + linalg.matvec(L, np.sqrt(d) * rng.standard_normal((2, B)))
     valid = np.arange(S)[:, None] <= count
-    valid[0] = (rng.random(B) < detection) & (there > 0)
+    valid[0] = (rng.random(B) < detection) & there
     return Reports(position, valid)
 
 
@@ -204,6 +224,42 @@ def prior(local: Local, survival: float, walk: float, birth: Local) -> tuple[Loc
     """One step of a target that walks at random, variance `walk` a step: what survives, and what is born."""
     moved = local.covariance + walk * np.eye(2)[..., None]
     return Local(survival * local.mass, local.mean, moved), birth
+
+
+def network(
+    rng: np.random.Generator, P: Floats, there: NDArray[np.bool_], kind: str
+) -> Iterator[tuple[Floats, Floats, Floats]]:
+    """Filters of N sensors with noise P (N, 2, 2, B) and one fed with all reports, step by step.
+
+    The target is there (K, B) or not, and starts about the origin. Yields the sensors' masses (N, B), the overlap
+    (B,) of their Gaussians at equal weights, and the mass (B,) of the filter fed with all.
+    """
+    N, B = len(P), P.shape[-1]
+    R = P.transpose(1, 2, 0, 3).reshape(2, 2, -1)
+    density = CLUTTER / (2 * HALF) ** 2
+
+    def step(local: Local) -> tuple[Local, ...]:
+        birth = BIRTH * (1.0 - local.mass) if kind == "bernoulli" else np.full(len(local.mass), BIRTH)
+        start = np.zeros((2, len(birth))), np.tile(ORIGIN**2 * np.eye(2)[..., None], (1, 1, len(birth)))
+        return prior(local, SURVIVAL, WALK, Local(birth, *start))
+
+    local = Local(np.zeros(N * B), np.zeros((2, N * B)), R)
+    centre = Local(np.zeros(B), np.zeros((2, B)), R[..., :B])
+    x, before = np.zeros((2, B)), np.zeros(B, dtype=np.bool_)
+    for now in there:
+        x = x + np.sqrt(WALK) * rng.standard_normal((2, B))
+        x = np.where(now & ~before, ORIGIN * rng.standard_normal((2, B)), x)
+        before = now
+        reports = report(rng, np.tile(x, N), np.tile(now, N), R, DETECTION, CLUTTER, HALF)
+        local = update(step(local), reports, R, DETECTION, density, kind)
+        for s in range(N):
+            at = slice(s * B, (s + 1) * B)
+            own = Reports(reports.position[..., at], reports.valid[:, at])
+            centre = update((centre,) if s else step(centre), own, R[..., at], DETECTION, density, kind)
+        z = overlap(
+            local.mean.reshape(2, N, B).swapaxes(0, 1), local.covariance.reshape(2, 2, N, B).transpose(2, 0, 1, 3)
+        )
+        yield local.mass.reshape(N, B), z, centre.mass
 
 
 def percent(hit: NDArray[Any]) -> tuple[float, float]:
