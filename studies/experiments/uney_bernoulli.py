@@ -29,7 +29,7 @@ import numpy as np
 
 from fusion_service import linalg
 from fusion_service.densities import chernoff_gaussians, overlap_gaussians
-from fusion_service.existence import fuse_cardinality, fuse_existence, loses_existence
+from fusion_service.existence import fuse_cardinality, fuse_existence, loses_existence, loss_bound
 from studies import uney
 from studies.pictures import colour, ellipse
 from studies.statistics import mean
@@ -158,6 +158,17 @@ def run(run: Run) -> Result:
         at = int(np.argmin(np.abs(KAPPAS - kappa)))
         rows.append(Row(f"example, kappa = {kappa:.0f}", "EMD existence, omega = 1/2", None, float(alpha[50, at])))
         rows.append(Row(f"example, kappa = {kappa:.0f}", "consistent existence", 0.8, float(fuse_existence(R))))
+    for kappa in (10.0, 20.0, 40.0):
+        at = int(np.argmin(np.abs(KAPPAS - kappa)))
+        need = "both sources must say for the EMD to reach 1/2"
+        rows.append(Row(f"example, kappa = {kappa:.0f}", need, None, float(1.0 / (1.0 + z[50, at]))))
+    for other in (0.6, 0.9, 0.95):
+        bound = float(loss_bound([[0.2, 0.8], [1 - other, other]], [1.0, 1.0])[1])
+        reached = KAPPAS[z[50] < bound]
+        label = f"0.8 and {other}, omega = 1/2"
+        rows.append(Row(label, "below both where z is below (corollary 3.2)", None, bound))
+        if len(reached):
+            rows.append(Row(label, "that is, in the example, from kappa", None, float(reached[0])))
     for stretch in (0.0, 2.0, 4.0):
         value = fuse_existence(R, "geometric", overlap=uney.overlap(*uney.example(np.array([20.0]), stretch))[0])
         rows.append(

@@ -186,12 +186,12 @@ def run(run: Run) -> Result:
             rows.append(Row(f"binomials {label}, EMD, z = {z}", "MAP", None, float(cardinality_map(at))))
             rows.append(Row(f"binomials {label}, EMD, z = {z}", "mean", None, float(cardinality_mean(at))))
         bound, threshold = losses(pmfs)
-        n = np.arange(len(pmfs[0]))
+        every = np.arange(len(pmfs[0]))
         lost = loses_cardinality(np.broadcast_to(pmfs, (len(Z), *pmfs.shape)), Z, np.full((len(Z), 2), 0.5))
         claims |= {
             f"{label}: the peak moves with z": len(np.unique(best[:, 50])) > 1,
             f"{label}: (33) grows with n at omega = 1/2": bool((np.diff(bound, axis=1) > 0).all()),
-            f"{label}: every n above (34) is lost, omega = 1/2": bool(lost[n > threshold[:, 50, None]].all()),
+            f"{label}: every n above (34) is lost, omega = 1/2": bool(lost[every > threshold[:, 50, None]].all()),
             f"{label}: the consistent p is nowhere below both": bool((p >= pmfs.min(axis=0) * (1 - 1e-12)).all()),
         }
         if number == 5:
@@ -236,7 +236,8 @@ def run(run: Run) -> Result:
         f"By bisection omega_c* is {omegas['of 5']:.5f} and {omegas['of 35']:.5f}: the published 0.5090 is cut "
         "off, not rounded. Algorithm 2 is started at 1/2, the paper does not say where; the first of its two updates "
         f"gives {once:.5f} for the latter.",
-        "The N of (16) spoils the step only, not the root, which is that of N' alone: what fails does not settle.",
+        "The N of (16) spoils the step, not the root, which is that of N' alone: N is too small by about z^n, and the "
+        "second derivative turns negative.",
         "The threshold (34) says that every number above it is lost, not that what lies below it is kept: it does not "
         "tell where the most probable number is right.",
         f"End to end the overlap is {overlaps[0]:.2f} for two sensors and {overlaps[1]:.2f} for four on average at "

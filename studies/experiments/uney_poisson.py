@@ -197,7 +197,7 @@ def draw(
     axes[0, 1].legend(frameon=False, fontsize=8, loc="upper left")
     rates, overlap = pairs
     r, lost = rates.max(axis=1) / rates.min(axis=1), loses_rate(rates, overlap)
-    axes[0, 2].plot(r[~lost], overlap[~lost], ".", color="#bbbbbb", ms=3, label="between the sources, or above")
+    axes[0, 2].plot(r[~lost], overlap[~lost], ".", color="#bbbbbb", ms=3, label="not below both")
     axes[0, 2].plot(r[lost], overlap[lost], ".", color="#d55e00", ms=3, label="below both (31)")
     axes[0, 2].plot(ratio, 1 / ratio, "k-", lw=1.2, label="(32): z = 1/ratio")
     axes[0, 2].plot(ratio, ratio**-0.5, "k--", lw=1.2, label="exact at $\\omega$ = 1/2")
@@ -205,7 +205,7 @@ def draw(
         title="Random pairs, EMD", xlabel="ratio of the rates", ylabel="overlap z", xscale="log", ylim=(0, 1)
     )
     axes[0, 2].set(xlim=(1, 20))
-    axes[0, 2].legend(fontsize=8, loc="upper right")
+    axes[0, 2].legend(frameon=False, fontsize=8, loc="upper right", ncol=2, markerscale=3)
     axes[1, 0].boxplot(list(many.values()), positions=list(many), whis=(5, 95), showfliers=False, widths=0.6)
     axes[1, 0].axhline(RATE, color=COLOURS["consistent"])
     axes[1, 0].set(title="N sensors of 10, $\\kappa$ = 20: EMD\n(5 to 95 %); consistent: green", xlabel="N")
@@ -217,7 +217,7 @@ def draw(
         ax.set(
             title=f"PHD filters of {N} sensors, $\\kappa$ = 20: mean number", xlabel="step", ylabel="number of targets"
         )
-    axes[1, 1].legend(frameon=False, fontsize=8, loc="upper left")
+    axes[1, 1].legend(frameon=False, fontsize=8, loc="lower right", ncol=2)
 
 
 STUDIES = (
