@@ -345,6 +345,6 @@ STUDIES = (
         run=run,
         runs=2_000,
         quick=50,
-        seconds=30.0,
+        seconds=10.0,
     ),
 )

@@ -202,7 +202,7 @@ def draw(
     axes[0, 2].plot(ratio, 1 / ratio, "k-", lw=1.2, label="(32): z = 1/ratio")
     axes[0, 2].plot(ratio, ratio**-0.5, "k--", lw=1.2, label="exact at $\\omega$ = 1/2")
     axes[0, 2].set(
-        title="Random pairs, EMD", xlabel="ratio of the rates", ylabel="overlap z", xscale="log", ylim=(0, 1)
+        title="Random pairs, EMD", xlabel="ratio of the rates", ylabel="overlap z", xscale="log", ylim=(0, 1.2)
     )
     axes[0, 2].set(xlim=(1, 20))
     axes[0, 2].legend(frameon=False, fontsize=8, loc="upper right", ncol=2, markerscale=3)
@@ -229,6 +229,6 @@ STUDIES = (
         run=run,
         runs=2_000,
         quick=50,
-        seconds=60.0,
+        seconds=15.0,
     ),
 )
