@@ -251,8 +251,9 @@ def run(run: Run) -> Result:
         f"Started at 0 it takes {zero.mean():.1f} on average, {zero.max()} at most; at the omega* of the kappa before, "
         f"{follow.mean():.1f} and {follow.max()}.",
         f"With equal weights the EMD of the example falls below one half at kappa = {crossing:.1f}.",
-        'The paper expects the loss "with overwhelming probability": of equal existences it is certain, of unequal ones '
-        f"as drawn here it is a matter of about one half ({shares[0]:.0f} % at omega = 1/2, {shares[1]:.0f} % at omega*).",
+        'The paper expects the loss "with overwhelming probability": of equal existences it is certain, of unequal '
+        f"ones as drawn here it is a matter of about one half ({shares[0]:.0f} % at omega = 1/2, {shares[1]:.0f} % at "
+        "omega*).",
         "Of two sources, consistent, average and the EMD with z = 1 decide alike: each exceeds 1/2 exactly where the "
         "existences add to more than 1. What the EMD misses beyond them is the overlap's doing alone. Of more "
         "sources the consistent method looks at the least and the largest: it misses less, and lets through more "
