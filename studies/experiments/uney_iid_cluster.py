@@ -236,8 +236,8 @@ def run(run: Run) -> Result:
         f"By bisection omega_c* is {omegas['of 5']:.5f} and {omegas['of 35']:.5f}: the published 0.5090 is cut "
         "off, not rounded. Algorithm 2 is started at 1/2, the paper does not say where; the first of its two updates "
         f"gives {once:.5f} for the latter.",
-        "The N of (16) is too small by about z^n. Of unlike pairs the second derivative then mostly comes out negative, "
-        "and the steps either lead away or are so short that the iteration settles where no root is.",
+        "The N of (16) is too small by about z^n. Of unlike pairs the second derivative then mostly comes out "
+        "negative, and the steps either lead away or are so short that the iteration settles where no root is.",
         "The threshold (34) says that every number above it is lost, not that what lies below it is kept: it does not "
         "tell where the most probable number is right.",
         f"End to end the overlap is {overlaps[0]:.2f} for two sensors and {overlaps[1]:.2f} for four on average at "
