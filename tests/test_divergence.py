@@ -18,6 +18,7 @@ from fusion_service.densities import (
     chernoff_mixtures,
     kl_bounds,
     kl_gaussians,
+    overlap_gaussians,
 )
 
 Array = NDArray[np.float64]
@@ -72,6 +73,33 @@ def test_two_gaussians_are_equally_far_from_their_mean(seed: int, n: int) -> Non
     m = C @ np.einsum("i,ijk,ik->j", w, np.linalg.inv(P), x)
     far = [kl_gaussians(m[:, None], C[..., None], x[i][:, None], P[i][..., None])[0] for i in (0, 1)]
     assert far[0] == pytest.approx(far[1], rel=1e-6, abs=1e-9)
+
+
+@given(seeds, dimensions)
+@settings(max_examples=30, deadline=None)
+def test_overlap_and_its_derivatives_by_differences(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    x, P = sources(rng, 2, n)
+
+    def at(t: float) -> float:
+        return log_z(np.array([1 - t, t]), x, P)
+
+    t, h = 0.2 + 0.6 * rng.random(), 1e-3
+    log, gradient, hessian = overlap_gaussians(x[..., None], P[..., None], np.array([[1 - t], [t]]))
+    assert log[0] == pytest.approx(at(t), abs=1e-8)
+    first = (8 * (at(t + h) - at(t - h)) - at(t + 2 * h) + at(t - 2 * h)) / (12 * h)
+    assert gradient[1, 0] - gradient[0, 0] == pytest.approx(first, rel=1e-5, abs=1e-6)
+    second = (at(t + h) - 2 * at(t) + at(t - h)) / h**2
+    bend = hessian[0, 0, 0] + hessian[1, 1, 0] - 2 * hessian[0, 1, 0]
+    assert bend == pytest.approx(second, rel=1e-3, abs=1e-4)
+
+
+def test_overlap_of_three_on_a_grid() -> None:
+    x, P, w = np.array([[0.0], [1.0], [2.5]]), np.array([[[1.0]], [[2.0]], [[0.5]]]), np.array([0.2, 0.3, 0.5])
+    logs = -0.5 * (GRID - x) ** 2 / P[:, 0] - 0.5 * np.log(2 * np.pi * P[:, 0])
+    integral = np.exp(w @ logs).sum() * STEP
+    log, _, _ = overlap_gaussians(x[..., None], P[..., None], w[:, None])
+    assert np.exp(log[0]) == pytest.approx(integral, abs=1e-9)
 
 
 @given(seeds)

@@ -5,7 +5,14 @@ batch = Mixtures.of([mixture, ...])                    # many, batch-last, trust
 reduce_mixture(mixture, max_components=4, prune=1e-4)
 """
 
-from .divergence import chernoff_discrete, chernoff_gaussians, chernoff_mixtures, kl_bounds, kl_gaussians
+from .divergence import (
+    chernoff_discrete,
+    chernoff_gaussians,
+    chernoff_mixtures,
+    kl_bounds,
+    kl_gaussians,
+    overlap_gaussians,
+)
 from .mixture import DensityError, Mixture, Mixtures, log_gaussian, log_sum, moments, power_product
 from .reduction import reduce_mixture, reduce_mixtures
 from .sampling import draws, halved_sum, sampled_moments
@@ -24,6 +31,7 @@ __all__ = [
     "log_gaussian",
     "log_sum",
     "moments",
+    "overlap_gaussians",
     "power_product",
     "reduce_mixture",
     "reduce_mixtures",

@@ -23,7 +23,14 @@ from ..linalg import FloatArray, total
 from .mixture import LOG_2PI, Mixture, Mixtures, log_gaussian, log_sum
 from .sampling import draws, halved_sum
 
-__all__ = ["chernoff_discrete", "chernoff_gaussians", "chernoff_mixtures", "kl_bounds", "kl_gaussians"]
+__all__ = [
+    "chernoff_discrete",
+    "chernoff_gaussians",
+    "chernoff_mixtures",
+    "kl_bounds",
+    "kl_gaussians",
+    "overlap_gaussians",
+]
 
 ROUNDS = 60
 DECREMENT = 1e-22
@@ -78,21 +85,44 @@ def chernoff_gaussians(means: FloatArray, covariances: FloatArray) -> FloatArray
     logdet = np.log(det)
 
     def oracle(w: FloatArray, at: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
-        Ai, xi = A[..., at], x[..., at]
-        C = linalg.inverse(total(np.moveaxis(w * Ai, 2, 0)))
-        m = linalg.matvec(C, total((w * linalg.matvec(Ai, xi)).swapaxes(0, 1)))
-        d = xi - m[:, None]
-        u = linalg.matvec(Ai, d)
-        gradient = -0.5 * (logdet[:, at] + linalg.inner(Ai, C[:, :, None]) + total(d * u))
-        X = linalg.product(Ai, C[:, :, None])
-        Cu = linalg.matvec(C[:, :, None], u)
-        hessian = total(u[:, :, None] * Cu[:, None])
-        for p in range(len(C)):
-            for q in range(len(C)):
-                hessian += 0.5 * X[p, q][:, None] * X[q, p][None]
-        return gradient, hessian
+        C = linalg.inverse(total(np.moveaxis(w * A[..., at], 2, 0)))
+        return _slopes(w, x[..., at], A[..., at], logdet[:, at], C)[1:]
 
     return _minimise(oracle, *det.shape)
+
+
+def overlap_gaussians(
+    means: FloatArray, covariances: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """log z (B,) of the weighted geometric mean of Gaussians (Uney (25), corrected), its gradient (N, B) and Hessian
+    (N, N, B) in the weights (N, B), which sum to 1: of the gradient only differences mean something.
+
+    Of two, with A = C1^-1 - C0^-1 and w = w_1: d log z / dw = g_1 - g_0 = KL(f_w || f_0) - KL(f_w || f_1) (Uney (54)),
+    d2 log z / dw2 = H_00 + H_11 - 2 H_01 = tr((A C)^2) / 2 + d'C d, d = C1^-1 (m - m_1) - C0^-1 (m - m_0).
+    """
+    A, det, _ = linalg.sweep(covariances.transpose(1, 2, 0, 3))
+    C, precision, _ = linalg.sweep(total(np.moveaxis(weights * A, 2, 0)))
+    with np.errstate(all="ignore"):
+        x, logdet = (means - means[:1]).transpose(1, 0, 2), np.log(det)
+        square, gradient, hessian = _slopes(weights, x, A, logdet, C)
+        return -0.5 * (total(weights * logdet) + np.log(precision) + square), gradient, hessian
+
+
+def _slopes(
+    w: FloatArray, x: FloatArray, A: FloatArray, logdet: FloatArray, C: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """sum_i w_i |x_i - m|^2 in A_i (B,), with the gradient and the Hessian of log z, of precisions A (n, n, N, B)."""
+    m = linalg.matvec(C, total((w * linalg.matvec(A, x)).swapaxes(0, 1)))
+    d = x - m[:, None]
+    u = linalg.matvec(A, d)
+    far = total(d * u)
+    gradient = -0.5 * (logdet + linalg.inner(A, C[:, :, None]) + far)
+    X = linalg.product(A, C[:, :, None])
+    hessian = total(u[:, :, None] * linalg.matvec(C[:, :, None], u)[:, None])
+    for p in range(len(C)):
+        for q in range(len(C)):
+            hessian += 0.5 * X[p, q][:, None] * X[q, p][None]
+    return total(w * far), gradient, hessian
 
 
 def chernoff_discrete(logs: FloatArray, base: FloatArray) -> FloatArray:
