@@ -74,12 +74,9 @@ def test_the_centralised_filter_reports_its_error_and_no_linear_rule_errs_less_t
                 assert np.linalg.eigvalsh(G @ J @ G.T - best).min() > -1e-12
 
 
-@each_reading
-def test_with_a_static_state_the_best_of_all_estimates_is_the_centralised_one(reading: Reading) -> None:
+@pytest.mark.parametrize("model", [networks.PRINTED, networks.ROTATION])
+def test_with_a_static_state_the_best_of_all_estimates_is_the_centralised_one(model: Model) -> None:
     """Measurements and priors, all at once by least squares."""
-    if reading.model.steps > 1:
-        pytest.skip("the state moves")
-    model = reading.model
     one = np.linalg.inv(model.prior)
     seen = np.einsum("kji,kjl,klm->im", model.H, np.linalg.inv(model.R), model.H)
     for prior, copies in (("common", 1), ("independent", len(model.H))):
