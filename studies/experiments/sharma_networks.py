@@ -282,7 +282,7 @@ STUDIES = (
         about=ABOUT[2],
         run=partial(run, number=2),
         runs=50_000,
-        quick=800,
+        quick=400,
         seconds=100.0,
         takes_rules=True,
     ),
