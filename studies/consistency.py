@@ -70,7 +70,7 @@ def draw(figure: Any, shown: Mapping[str, Consistency], title: str, columns: int
     count = len(shown)
     panels = figure.subplots(-(-count // columns), columns, sharex=True, sharey=True, squeeze=False).ravel()
     reach = np.sort([2 * np.sqrt(max(one.covariance.max(), one.mse.max())) for one in shown.values()])
-    limit = 1.08 * reach[reach <= 2.0 * np.median(reach)].max()
+    limit = 1.08 * np.max(reach, where=reach <= 1.8 * np.nanmedian(reach), initial=0.0)
     reference = ellipse(np.zeros(2), next(iter(shown.values())).mse)
     for axes, (label, one) in zip(panels, shown.items(), strict=False):
         axes.fill(*reference, color="#d4d4d4", zorder=0)
