@@ -179,7 +179,7 @@ def claims(found: Mapping[Key, Consistency], blocks: Mapping[Key, Floats], readi
         f"three (yes): {lowest(lead)}; of all conservative rules these err less: {', '.join(less) or 'none'}. HMD-GA "
         f"near the centralised filter (yes): its true trace is "
         f"{hmd.true.value / best.true.value:.2f} times that filter's (with all correlations known "
-        f"{bound / best.true.value:.2f}), what it reports {hmd.reported.value / best.true.value:.2f} times."
+        f"{bound / best.reported.value:.2f}), what it reports {hmd.reported.value / best.true.value:.2f} times."
     )
 
 
