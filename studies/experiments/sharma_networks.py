@@ -281,7 +281,7 @@ STUDIES = (
         run=partial(run, number=1),
         runs=50_000,
         quick=400,
-        seconds=100.0,
+        seconds=50.0,
         takes_rules=True,
     ),
     Study(
@@ -292,7 +292,7 @@ STUDIES = (
         run=partial(run, number=2),
         runs=50_000,
         quick=400,
-        seconds=100.0,
+        seconds=20.0,
         takes_rules=True,
     ),
 )

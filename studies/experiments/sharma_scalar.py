@@ -144,7 +144,7 @@ STUDIES = (
         run=run,
         runs=10_000,
         quick=500,
-        seconds=20.0,
+        seconds=10.0,
         published_runs=500,
     ),
 )
