@@ -102,7 +102,7 @@ def peaks(f: Floats, grid: Floats = GRID) -> tuple[Floats, Floats]:
     top = 1 + np.flatnonzero((inner > f[:-2]) & (inner >= f[2:]) & (inner > 1e-9))
     if not len(top):
         return np.zeros(0), np.zeros(0)
-    valleys = [a + int(np.argmin(f[a:b])) for a, b in pairwise(top)]
+    valleys: list[int] = [int(a + np.argmin(f[a:b])) for a, b in pairwise(top)]
     mass = np.add.reduceat(f, [0, *valleys]) * (grid[1] - grid[0])
     order = np.argsort(-mass, kind="stable")
     return mass[order], grid[top[order]]
@@ -271,10 +271,10 @@ def _notes(rows: list[Row]) -> tuple[str, ...]:
         f"{value('Fig. 8, threshold, share of trials: GA (49)', share)} by threshold: the trial shown is typical.",
         f"More sensors make GA worse: {holds(grows)} for every GA. GOSPA of 8 sensors less that of 2, by rank: "
         f"{worse('rank')}; by threshold: {worse('threshold')}.",
-        "The text has it that one silent sensor ends a target in GA, however many see it. Of the exact GA of Gaussians "
-        "that is not so: as N grows, it tends to exp(E log f), a fixed remnant, which the tails of the neighbours give; "
-        "hence its curve flattens. In the product's cells, where a component that is not there has no tail, it is so: "
-        "all N see a target with probability 0.9^N (cells GA).",
+        "The text has it that one silent sensor ends a target in GA, however many see it. Of the exact GA of "
+        "Gaussians that is not so: as N grows, it tends to exp(E log f), a fixed remnant, which the tails of the "
+        "neighbours give; hence its curve flattens. In the product's cells, where a component that is not there has no "
+        "tail, it is so: all N see a target with probability 0.9^N (cells GA).",
         "(49) and the exact GA: for many sensors (49) is no approximation. 1/N widens every component by sqrt(N) "
         f"before all N are multiplied, and every choice of one each counts: with six sensors its mass is off by "
         f"{value('Fig. 8, rank: GA (49)', 'mass - 5')}, with the widths of Fig. 7 by "
