@@ -361,7 +361,7 @@ STUDIES = (
         about=__doc__ or "",
         run=run,
         runs=2_000,
-        quick=50,
+        quick=40,
         seconds=100.0,
     ),
 )

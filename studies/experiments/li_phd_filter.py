@@ -246,7 +246,7 @@ STUDIES = (
         about=__doc__ or "",
         run=run,
         runs=200,
-        quick=3,
+        quick=2,
         seconds=100.0,
     ),
 )
