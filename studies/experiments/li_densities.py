@@ -303,8 +303,8 @@ def run(run: Run) -> Result:
         f"every weight in {100 * never:.0f} %, and in no other place than beyond the mean of the wider one "
         f"({other_side:.4f}).",
         f"(49): its mass is {dropped:.4f}, {100 * (dropped / truth - 1):.0f} % above the exact "
-        f"{truth:.4f}. It makes sense, as the paper says, for modes well apart: a density of two equal "
-        f"modes averaged with itself gains less than 1 % beyond {np.sqrt(8 * np.log(100)):.1f} sigma only, and 14 % at 4 sigma.",
+        f"{truth:.4f}. It makes sense, as the paper says, for modes well apart: a density of two equal modes averaged "
+        f"with itself gains less than 1 % beyond {np.sqrt(8 * np.log(100)):.1f} sigma only, and 14 % at 4 sigma.",
         "4.1, appendix B: AA keeps the mean, GA does not. Its f1 is said to be uniform on (0, 1]; by its formula it is "
         "on (0, 4 sqrt(2) / 3], which gives the mean that it needs.",
     )
@@ -355,6 +355,6 @@ STUDIES = (
         run=run,
         runs=1_000_000,
         quick=4_000,
-        seconds=10.0,
+        seconds=6.0,
     ),
 )

@@ -360,7 +360,7 @@ STUDIES = (
         source="Li-2nd 5, Figs. 7 and 8, remarks 9 and 10",
         about=__doc__ or "",
         run=run,
-        runs=2_000,
+        runs=1_000,
         quick=40,
         seconds=100.0,
     ),

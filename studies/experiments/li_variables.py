@@ -387,6 +387,6 @@ STUDIES = (
         run=run,
         runs=1_000_000,
         quick=20_000,
-        seconds=20.0,
+        seconds=35.0,
     ),
 )
