@@ -362,6 +362,6 @@ STUDIES = (
         run=run,
         runs=1_000,
         quick=40,
-        seconds=100.0,
+        seconds=60.0,
     ),
 )

@@ -247,6 +247,6 @@ STUDIES = (
         run=run,
         runs=200,
         quick=2,
-        seconds=100.0,
+        seconds=130.0,
     ),
 )
