@@ -266,8 +266,8 @@ def _notes(rows: list[Row]) -> tuple[str, ...]:
         f"Remark 9, lighter tails: {holds(lighter)} ({value('Fig. 7: GA exact', tail)} of the exact GA against "
         f"{value('Fig. 7: AA', tail)}). More significant peaks: {holds(exact_peak > aa_peak)} of the intensities "
         "themselves, since a geometric mean is nowhere above the arithmetic one: highest peak "
-        f"{exact_peak:.4f} against {aa_peak:.4f}. The {value('Fig. 7: GA (49)', peak)} that (49) gives, which is what "
-        "the paper draws, is of the dropped cross terms. The remark is right of densities: scaled to AA's mass the "
+        f"{exact_peak:.4f} against {aa_peak:.4f}. The {value('Fig. 7: GA (49)', peak)} that (49) gives, by which the "
+        "paper averages, is of the dropped cross terms. The remark is right of densities: scaled to AA's mass the "
         f"exact GA's peak is {value('Fig. 7: GA exact', 'the same, at AA' + chr(39) + 's mass')}.",
         f"Remark 10 {holds(false[0] < false[1])}: of the isolated component AA keeps half, the exact GA "
         f"{value('Fig. 7: GA exact', 'mass above 75 (isolated)')} above 75 against "
