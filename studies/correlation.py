@@ -5,9 +5,9 @@ x_N - x_1), so its error is e_1 + g(d); with E[e_1 | d] = B d,
 
     MSE = P_1 + B E[d g'] + E[g d'] B' + E[g g']
 
-and only d is drawn. The draws are whitened (mean square exactly I), so that the MSE of a rule whose gain does not depend
-on d is exact, and so is the mean covariance of one that is quadratic in d. A rule's excess is the largest eigenvalue of
-its MSE relative to its mean reported covariance: above 1 it is not conservative.
+and only d is drawn. The draws are whitened (mean square exactly I), so that the MSE of a rule whose gain does not
+depend on d is exact, and so is the mean covariance of one that is quadratic in d. A rule's excess is the largest
+eigenvalue of its MSE relative to its mean reported covariance: above 1 it is not conservative.
 
 A bound rho on the correlation, ||P_i^-1/2 P_ij P_j^-T/2|| <= rho, leaves for error combinations a_i = L_i' G_i' u of a
 rule with gains G_i the worst case u' MSE u = sum |a_i|^2 + rho sum_(i != j) |a_i||a_j|, reached by P_ij = rho L_i
@@ -40,6 +40,7 @@ __all__ = [
     "joint_of",
     "largest_correlation",
     "mse",
+    "optimal",
     "rank_one",
     "top",
     "whitened",
@@ -80,8 +81,8 @@ def top(mse: Floats, reported: Floats) -> tuple[Floats, Floats]:
 
 
 def joint_of(P: Floats, K: Floats) -> Floats:
-    """J (B, N n, N n) of covariances P and correlations K (B, N n, N n) between the errors whitened by Cholesky factors,
-    identity blocks on its diagonal."""
+    """J (B, N n, N n) of covariances P and the correlations K (B, N n, N n), identity blocks on its diagonal, of the
+    errors whitened by Cholesky factors."""
     B, N, n, _ = P.shape
     L = np.linalg.cholesky(P)
     blocks = L[:, :, None] @ K.reshape(B, N, n, N, n).swapaxes(2, 3) @ transpose(L)[:, None]
@@ -139,10 +140,8 @@ def expected(rule: Fuser, P: Floats, J: Floats, z: Floats) -> Outcome:
     """`rule` told P (B, N, n, n), on errors of joint covariance J, by the draws z ((N - 1) n, M)."""
     B, N, n, _ = P.shape
     M = z.shape[1]
-    e = J.reshape(B, N, n, N, n)
-    differences = e[:, 1:] - e[:, :1]
-    D = (differences[:, :, :, 1:] - differences[:, :, :, :1]).reshape(B, (N - 1) * n, -1)
-    cross = transpose(differences[:, :, :, 0].reshape(B, (N - 1) * n, n))  # E[e_1 d']
+    H = _differences(N, n)
+    D, cross = H @ J @ H.T, J[:, :n] @ H.T  # E[d d'], E[e_1 d']
     values, V = np.linalg.eigh(D)
     root = np.sqrt(np.maximum(values, 0.0))
     scale = np.where(values > 1e-10 * values[:, -1:], 1.0 / np.maximum(root, 1e-150), 0.0)
@@ -158,7 +157,7 @@ def expected(rule: Fuser, P: Floats, J: Floats, z: Floats) -> Outcome:
     )
     others = gain.reshape(B, n, N - 1, n).swapaxes(1, 2)
     gains = np.concatenate([np.eye(n) - others.sum(axis=1, keepdims=True), others], axis=1)
-    true = e[:, 0, :, 0] + shared + transpose(shared) + g @ transpose(g) / M
+    true = J[:, :n, :n] + shared + transpose(shared) + g @ transpose(g) / M
     return Outcome(0.5 * (true + transpose(true)), reported.mean(axis=-1), gains, constant)
 
 
@@ -167,6 +166,22 @@ def mse(gains: Floats, J: Floats) -> Floats:
     B, N, n, _ = gains.shape
     G = gains.swapaxes(1, 2).reshape(B, n, N * n)
     return np.asarray(G @ J @ transpose(G))
+
+
+def _differences(N: int, n: int) -> Floats:
+    """H ((N - 1) n, N n) of d = H e."""
+    return np.kron(np.concatenate([-np.ones((N - 1, 1)), np.eye(N - 1)], axis=1), np.eye(n))
+
+
+def optimal(J: Floats, n: int) -> Floats:
+    """Covariance (B, n, n) of the best linear fusion of sources with joint covariance J, which may be singular."""
+    N = J.shape[1] // n
+    s = np.sqrt(np.diagonal(J, axis1=1, axis2=2)[:, :n])  # units of the components
+    units, H = np.tile(s, (1, N)), _differences(N, n)
+    U = J / (units[:, :, None] * units[:, None])
+    cross = H @ U[:, :, :n]
+    P = U[:, :n, :n] - transpose(cross) @ np.linalg.pinv(H @ U @ H.T, 1e-11, hermitian=True) @ cross
+    return np.asarray(P * s[:, :, None] * s[:, None])
 
 
 def rank_one(gains: Floats, P: Floats, u: Floats, rho: float | Floats) -> Floats:

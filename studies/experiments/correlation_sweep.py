@@ -2,9 +2,9 @@
 
 Pairs: P1 = T T', P2 = T diag(r) T', the variance ratios r_k independent and log-uniform in [1/16, 16]; T a random
 rotation times sizes log-uniform in [1/e, e] (no matter to rules that choose by determinant). The cross-covariance is
-C = L1 K L2' with Cholesky factors L; every K of spectral norm at most rho is admissible under the bound rho, and rho = 1
-admits every positive semidefinite joint covariance. Random K = rho U diag(s) V' with uniform (Haar) rotations U, V and
-s_k uniform in [0, 1]: "on average" below. Three sources, in two dimensions: r_k anew for the third.
+C = L1 K L2' with Cholesky factors L; every K of spectral norm at most rho is admissible under the bound rho, and
+rho = 1 admits every positive semidefinite joint covariance. Random K = rho U diag(s) V' with uniform (Haar) rotations U
+and V, and s_k uniform in [0, 1]. Three sources, in two dimensions: r_k anew for the third.
 
 Excess: the largest eigenvalue of the true mean squared error relative to the (mean) reported covariance. Above 1 there
 is a direction in which the rule is too sure. The tables give its mean over the pairs, with the standard error of that
@@ -16,10 +16,11 @@ mean; the notes give the largest of all pairs.
 * Rules that look at the difference of the means (`hmd-ga`, `aa`, `cu`): a tenth of the pairs; the mean over the
   difference by 256 whitened draws; K by search from the K worst for `naive` and for `ici`, by turns towards the K worst
   for the rule's own mean gain and by random steps. The K found is judged with 2,048 fresh draws. This is a lower bound
-  of the worst case. Sampled rules (2,000 samples, alpha = 1) are slow: a hundredth of the pairs, 32 draws, the
-  two starts only; their sampling error (some per cent) is in the excess.
-* Three sources: rules that fuse them at once; for data-dependent ones a lower bound from the naive rule's worst case and
-  two turns towards their own.
+  of the worst case.
+* Sampled rules (2,000 samples, alpha = 1) are slow: a fiftieth of the pairs, 32 draws, no search beyond the two
+  starts, up to three dimensions; their sampling error, some per cent, is in the excess.
+* Three sources: rules that fuse them at once; for data-dependent ones a lower bound from the naive rule's worst case
+  and two turns towards their own.
 
 Size: geometric mean of (det P)^(1/n), reported or true, relative to the optimal fusion, which knows C
 (`bar-shalom-campo`). 1 reported is as tight as any honest rule can be, 1 true as accurate.
@@ -43,6 +44,7 @@ from studies.correlation import (
     independent,
     joint_of,
     mse,
+    optimal,
     rank_one,
     top,
     worst,
@@ -165,13 +167,6 @@ def worst_of(rule: Fuser, known: Outcome | None, P: Floats, few: int, rng: np.ra
     return excess(outcome.mse, outcome.reported).reshape(len(BOUNDS), B)
 
 
-def optimum(J: Floats, n: int) -> Floats:
-    """log det / n (B,) of the best linear fusion of sources with joint covariance J."""
-    B, size, _ = J.shape
-    H = np.broadcast_to(np.tile(np.eye(n), (size // n, 1)), (B, size, n))
-    return np.asarray(-np.linalg.slogdet(H.swapaxes(1, 2) @ np.linalg.solve(J, H))[1] / n)
-
-
 def study(task: Task) -> Found:
     """Everything about one rule in one dimension."""
     seed, runs, n, N, rule = task
@@ -194,11 +189,12 @@ def study(task: Task) -> Found:
     answers = []
     for rho in SHOWN:
         J = joint_of(P, whole(rho * K))
+        best = np.linalg.slogdet(optimal(J, n))[1] / n
         if known is not None:
             error, claimed = mse(np.tile(known.gains, (several, 1, 1, 1)), J), np.tile(known.reported, (several, 1, 1))
         else:
             error, claimed, _, _ = expected(rule, P, J, draws(rng, n, few))
-        sizes = (np.linalg.slogdet(which)[1] / n - optimum(J, n) for which in (claimed, error))
+        sizes = (np.linalg.slogdet(which)[1] / n - best for which in (claimed, error))
         answers.append(np.stack([excess(error, claimed), *sizes]).reshape(3, several, -1).mean(axis=1))
     average, reported, true = np.stack(answers, axis=1)
     return Found(worst_found, average, reported, true)
@@ -271,33 +267,33 @@ def _notes(found: Answers, rules: Sequence[Fuser]) -> tuple[str, ...]:
 
 
 def _draw(found: Answers, labels: Sequence[str], figure: Any) -> None:
-    left, right = figure.subplots(1, 2)
-    dashes = ("-", "--", ":")
+    left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     seen: list[str] = []
     for label in labels:
         colour = pictures.colour(label)
+        kind = seen.count(colour) % 3
         seen.append(colour)
-        style = dashes[min(seen.count(colour), 3) - 1]
         n = [one for one in DIMENSIONS if (label, one, 2) in found]
-        left.semilogy(
-            n,
-            [found[label, one, 2].worst[-1].mean() for one in n],
-            style,
-            color=colour,
-            marker="o",
-            ms=3.5,
-            label=label,
-        )
-        if (label, 2, 2) not in found:
-            continue
-        one = found[label, 2, 2]
-        at = np.exp(one.reported[1].mean()), one.worst[-1].mean()
-        right.plot(*at, marker="osD"[min(seen.count(colour), 3) - 1], color=colour, ms=6)
-        right.annotate(label, at, (5, 3), textcoords="offset points", fontsize=7, color=colour)
-    left.axhline(1.0, color="#000000", lw=0.8)
-    right.axhline(1.0, color="#000000", lw=0.8)
+        value = [found[label, one, 2].worst[-1].mean() for one in n]
+        look: dict[str, Any] = {"color": colour, "marker": "osD"[kind]}
+        left.plot(n, value, ("-", "--", ":")[kind], ms=4, label=label, **look)
+        if max(n) >= 4:
+            one = found[label, 4, 2]
+            right.plot(np.exp(one.reported[-1].mean()), one.average[-1].mean(), "", ms=8, **look)
+    for axes in (left, right):
+        axes.axhline(1.0, color="#000000", lw=0.8)
+        axes.set_yscale("log")
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter("{x:g}")
+        axes.tick_params(which="both", labelsize=8)
+    left.set(xlabel="dimension n", ylabel="worst excess, correlation up to 1 (mean over pairs)", xticks=DIMENSIONS)
+    left.set_title("Above 1: too sure in some direction", fontsize=10)
     right.set_xscale("log")
-    left.legend(fontsize=7, ncols=2)
+    right.xaxis.set_major_formatter("{x:g}")
+    right.xaxis.set_minor_formatter("{x:g}")
+    right.set(xlabel="reported size / optimum's", ylabel="mean excess, random correlation up to 0.9")
+    right.set_title("The trade-off, n = 4", fontsize=10)
+    figure.legend(*left.get_legend_handles_labels(), loc="outside right upper", fontsize=8, frameon=False)
 
 
 STUDIES = (

@@ -1,0 +1,337 @@
+"""How correlated the errors of local tracks are in scenarios that trackers meet, and what each rule then gives: to choose
+the bound of `bci`, `max_correlation`, with a reason.
+
+That bound is on the largest singular value of L1^-1 P12 L2^-T, P1 = L1 L1' and P2 = L2 L2' as the tracks report them: the
+largest canonical correlation, over all combinations of position and velocity. Joint error covariances are exact: with
+gains K_i of Kalman filters that run alone,
+
+    J <- A J A' + B (1 1' x Q) B' + K R K',    A = (I - K H)(I x F), B = I - K H   (block-diagonal K, H)
+
+(Bar-Shalom's recursion for cross-covariances), a common measurement error being carried along as a state. A test
+compares them with simulated filters. Targets move in the plane with nearly constant velocity; every sensor measures the
+position once in a period T = 1 s, unless said.
+
+* Process noise: the same target seen by two or three sensors that share nothing else, in steady state. Index: q T^3 /
+  sigma^2 with the noise intensity q and the first sensor's standard deviation; 1:3 are the sensors' standard deviations.
+* Prior: both tracks start from one estimate (a steady track of index 0.1, handed over), no process noise, then k
+  measurements of each one's own.
+* Memory: the last fused result, predicted, beside the fusion of the new local tracks (index 0.1, 1:1), in steady state;
+  what is fused every second by the rules named.
+* Li-AA: its linear scenario, 20 and 40 m, Q = 25 G G', 60 steps; alone, or the fused result fed back to both filters.
+* Sharma 6.3: nodes S1 and S2 after five steps; "sampled from" a distribution is read as starts that are independent, or
+  one and the same.
+* Radars: those of Sharma 6.4 with this repository's numbers (100 m, 3 mrad, scans every 5 s for 300 s, q = 0.02 m2/s3;
+  no clutter and no misses), all pairs of radars that see a target throughout, on one plane, filters linearised at the
+  truth, speeds at first unknown to both alike. Straight: as the targets of the paper move, while the filters allow for
+  process noise. Manoeuvring: the process noise is real.
+* Navigation: lidar and radar on one platform (3 and 4 m, q = 0.05 m2/s3), whose own position errs by a common error, new
+  at each scan or correlated over 60 s. The filters allow for its variance, but not for its correlation in time.
+
+Tables: the correlation, of the full states and of positions alone; the largest eigenvalue of a track's true covariance
+relative to its reported one; variances of position, reported and true, relative to the optimal fusion, which knows J
+(`bar-shalom-campo`); and the excess, the largest eigenvalue of the true mean squared error relative to the reported
+covariance. Of several pairs of tracks, largest correlations and excess, mean ratios of variances. `bci`: at the
+scenario's own correlation (at most 1). `hmd-ga`: means over the difference of the tracks, by whitened draws.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import combinations
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from fusion_service import geodesy
+from schemas import Ecef
+from sensor_clients.scenarios.three_radars import DURATION, RADAR, RADARS, TRACKER, true_states
+from studies import pictures
+from studies.correlation import draws, excess, expected, independent, largest_correlation, mse, optimal
+from studies.rules import Fuser, fuser
+from studies.study import Floats, Result, Row, Run, Study
+
+PLACE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
+"""Position of a state x, vx, y, vy."""
+OWN_BOUND = "bci"
+GROUPS = 10
+"""Independent sets of draws, for the standard error."""
+
+
+class Tracks(NamedTuple):
+    """N tracks of one target, B times over: reported P (B, N, n, n), joint error covariance J (B, N n, N n)."""
+
+    P: Floats
+    J: Floats
+
+
+class Model(NamedTuple):
+    """F, Q (n, n) as filters have it; H (..., N, d, n), R (N, d, d); true: the process noise there is (None: Q);
+    shared: standard deviation of a common measurement error, and its correlation from one scan to the next."""
+
+    F: Floats
+    Q: Floats
+    H: Floats
+    R: Floats
+    true: Floats | None = None
+    shared: float = 0.0
+    decay: float = 0.0
+
+
+def planar(T: float, q: float) -> tuple[Floats, Floats]:
+    """F and Q (4, 4) of nearly constant velocity in the plane: x, vx, y, vy."""
+    F, Q = np.array([[1.0, T], [0.0, 1.0]]), q * np.array([[T**3 / 3, T**2 / 2], [T**2 / 2, T]])
+    return np.kron(np.eye(2), F), np.kron(np.eye(2), Q)
+
+
+def positions(T: float, q: float, sigmas: Sequence[float]) -> Model:
+    """Sensors of position with these standard deviations."""
+    return Model(*planar(T, q), np.tile(PLACE, (len(sigmas), 1, 1)), np.stack([s**2 * np.eye(2) for s in sigmas]))
+
+
+def blocks(A: Floats) -> Floats:
+    """Block-diagonal (B, N a, N b) of A (B, N, a, b)."""
+    B, N, a, b = A.shape
+    out = np.zeros((B, N, a, N, b))
+    out[:, range(N), :, range(N)] = A.swapaxes(0, 1)
+    return out.reshape(B, N * a, N * b)
+
+
+def filtered(start: Tracks, model: Model, steps: int, H: Floats | None = None) -> Tracks:
+    """After `steps` predictions and updates; H (steps, B, N, d, n) where it changes."""
+    P, (B, size, _) = start.P, start.J.shape
+    N, n, d = P.shape[1], P.shape[2], model.R.shape[1]
+    J = np.zeros((B, size + d, size + d))
+    J[:, :size, :size] = start.J
+    J[:, size:, size:] = model.shared**2 * np.eye(d)
+    Q = model.Q if model.true is None else model.true
+    common = np.zeros((size + d, size + d))
+    common[:size, :size] = np.tile(Q, (N, N))
+    common[size:, size:] = (1.0 - model.decay**2) * model.shared**2 * np.eye(d)
+    move = np.zeros_like(common)
+    move[:size, :size] = np.kron(np.eye(N), model.F)
+    move[size:, size:] = model.decay * np.eye(d)
+    R = model.R + model.shared**2 * np.eye(d)
+    A = np.broadcast_to(np.eye(size + d), J.shape).copy()
+    for k in range(steps):
+        h = np.broadcast_to(model.H if H is None else H[k], (B, N, d, n))
+        P = model.F @ P @ model.F.T + model.Q
+        K = P @ h.swapaxes(-1, -2) @ np.linalg.inv(h @ P @ h.swapaxes(-1, -2) + R)
+        P = P - K @ h @ P
+        P = 0.5 * (P + P.swapaxes(-1, -2))
+        A[:, :size, :size] = blocks(np.eye(n) - K @ h)
+        A[:, :size, size:] = K.reshape(B, size, d)
+        J = A @ (move @ J @ move.T + common) @ A.swapaxes(1, 2)
+        J[:, :size, :size] += blocks(K @ model.R @ K.swapaxes(-1, -2))
+    J = J[:, :size, :size]
+    return Tracks(P, 0.5 * (J + J.swapaxes(1, 2)))
+
+
+def alike(P: Floats, N: int, true: Floats | None = None) -> Tracks:
+    """N copies of one estimate that reports P (n, n)."""
+    return Tracks(np.tile(P, (1, N, 1, 1)), np.tile(P if true is None else true, (1, N, N)))
+
+
+def steady(model: Model, steps: int = 150) -> Tracks:
+    """The filters' tracks once their start is forgotten."""
+    N, n = model.H.shape[0], len(model.F)
+    return filtered(alike(100.0 * np.mean(model.R[:, 0, 0]) * np.eye(n), N), model, steps)
+
+
+def constant_gain(rule: Fuser, P: Floats) -> tuple[Floats, Floats]:
+    """Gains (B, N, n, n) and covariance (B, n, n) of a rule that does not look at the means."""
+    _, N, n, _ = P.shape
+    found = expected(rule, P, independent(P), draws(np.random.default_rng(0), (N - 1) * n, 0))
+    return found.gains, found.reported
+
+
+def fed_back(model: Model, start: Floats, rule: str, steps: int) -> Tracks:
+    """Local tracks just before they are fused, when both filters go on from the fused result."""
+    tracks = alike(start, 2)
+    for _ in range(steps - 1):
+        tracks = filtered(tracks, model, 1)
+        gains, P = constant_gain(fuser(rule), tracks.P)
+        tracks = alike(P[0], 2, mse(gains, tracks.J)[0])
+    return filtered(tracks, model, 1)
+
+
+def remembered(model: Model, rule: str, bound: float, steps: int = 60) -> Tracks:
+    """The predicted last result and the fusion, by `rule`, of new local tracks, which are fused with the former by `bci`
+    under `bound`."""
+    n, N = len(model.F), len(model.H)
+    seen = model._replace(  # the result is a filter that measures nothing
+        H=np.concatenate([np.zeros_like(model.H[:1]), model.H]), R=np.concatenate([model.R[:1], model.R])
+    )
+    tracks = alike(steady(model).P[0, 0], N + 1)
+    last = fuser(f"bci:max_correlation={bound}")
+    for k in range(steps):
+        tracks = filtered(tracks, seen, 1)
+        gains, P = constant_gain(fuser(rule), tracks.P[:, 1:])
+        first = np.zeros((1, 2 * n, (N + 1) * n))
+        first[:, :n, :n] = np.eye(n)
+        first[:, n:, n:] = gains.swapaxes(1, 2).reshape(1, n, N * n)
+        two = Tracks(np.stack([tracks.P[:, 0], P], axis=1), first @ tracks.J @ first.swapaxes(1, 2))
+        if k == steps - 1:
+            break
+        gains, P = constant_gain(last, two.P)
+        whole = np.broadcast_to(np.eye((N + 1) * n), tracks.J.shape).copy()
+        whole[:, :n] = gains.swapaxes(1, 2).reshape(1, n, 2 * n) @ first
+        tracks = Tracks(np.concatenate([P[:, None], tracks.P[:, 1:]], axis=1), whole @ tracks.J @ whole.swapaxes(1, 2))
+    return two
+
+
+def radars(manoeuvring: bool) -> Tracks:
+    """All pairs of radars that see a target from beginning to end."""
+    frame = RADARS["radar1"]
+
+    def east_north(states: Floats) -> Floats:
+        space = ("x", "y", "z", "vx", "vy", "vz")
+        zeros = np.zeros((*states.shape, 6))
+        return np.asarray(geodesy.transform(states, zeros, space, Ecef(), frame)[0][..., :2])
+
+    times = np.arange(0.0, DURATION + RADAR.period / 2, RADAR.period)
+    targets = east_north(true_states(times))
+    earth = [np.array([*geodesy.geodetic_to_ecef(r.lat, r.lon, r.alt), 0.0, 0.0, 0.0]) for r in RADARS.values()]
+    away = targets[:, :, None] - east_north(np.array(earth))  # (K, 20, 3, 2)
+    seen = (np.hypot(away[..., 0], away[..., 1]) < RADAR.field_of_view).all(axis=0)
+    pairs = [(t, [i, j]) for t in range(len(seen)) for i, j in combinations(range(3), 2) if seen[t, i] and seen[t, j]]
+    x, y = np.moveaxis(np.stack([away[:, t, two] for t, two in pairs], axis=1), -1, 0)  # (K, B, 2)
+    r2 = x**2 + y**2
+    H = np.zeros((*x.shape, 2, 4))
+    H[..., 0, 0], H[..., 0, 2] = x / np.sqrt(r2), y / np.sqrt(r2)
+    H[..., 1, 0], H[..., 1, 2] = -y / r2, x / r2
+    F, Q = planar(RADAR.period, TRACKER.motion.q)
+    R = np.tile(np.diag([RADAR.sigma_range**2, RADAR.sigma_azimuth**2]), (2, 1, 1))
+    B = len(pairs)
+    inverse = np.linalg.inv(H[0][..., [0, 2]])
+    P = np.zeros((B, 2, 4, 4))
+    P[..., ::2, ::2] = inverse @ R @ inverse.swapaxes(-1, -2)
+    P[..., 1::2, 1::2] = TRACKER.sigma_speed**2 * np.eye(2)
+    J = blocks(P).reshape(B, 2, 4, 2, 4)
+    J[:, 0, 1::2, 1, 1::2] = J[:, 1, 1::2, 0, 1::2] = TRACKER.sigma_speed**2 * np.eye(2)
+    model = Model(F, Q, H[0], R, Q if manoeuvring else np.zeros((4, 4)))
+    return filtered(Tracks(P, J.reshape(B, 8, 8)), model, len(times) - 1, H[1:])
+
+
+def scenarios() -> dict[str, Tracks]:
+    """By name."""
+    found = {}
+    for index in (0.001, 0.1, 10.0):
+        for ratio in (1, 3):
+            found[f"process noise, index {index:g}, 1:{ratio}"] = steady(positions(1.0, index, (1.0, ratio)))
+    found["process noise, index 0.1, 1:2:3"] = steady(positions(1.0, 0.1, (1.0, 2.0, 3.0)))
+    common, still = steady(positions(1.0, 0.1, (1.0, 1.0))).P[0, 0], positions(1.0, 0.0, (1.0, 1.0))
+    for k in (1, 3, 10, 30):
+        found[f"common prior, {k} own measurement{'s' * (k > 1)}"] = filtered(alike(common, 2), still, k)
+    new = positions(1.0, 0.1, (1.0, 1.0))
+    found["memory, naive and naive"] = remembered(new, "naive", 0.0)
+    found["memory, ci and bci 0.5"] = remembered(new, "ci", 0.5)
+    found["memory, ci and ci"] = remembered(new, "ci", 1.0)
+    G = np.kron(np.eye(2), np.array([[0.5], [1.0]]))
+    li = positions(1.0, 0.0, (20.0, 40.0))._replace(Q=25.0 * G @ G.T)
+    start = np.diag([500.0, 50.0, 500.0, 50.0])
+    found["Li-AA, no feedback"] = filtered(alike(start, 2), li, 60)
+    for rule in ("naive", "ci"):
+        found[f"Li-AA, feedback of {rule}"] = fed_back(li, start, rule, 60)
+    eye = np.eye(2)
+    sharma = Model(
+        np.array([[1.0, 0.5], [0.0, 1.0]]),
+        0.5 * eye,
+        np.stack([eye, eye]),
+        np.stack([np.diag([0.5, 0.2]), np.diag([0.1, 0.5])]),
+    )
+    P0 = alike(np.array([[2.0, 1.0], [1.0, 2.0]]), 2)
+    found["Sharma 6.3, independent starts"] = filtered(Tracks(P0.P, independent(P0.P)), sharma, 5)
+    found["Sharma 6.3, one start"] = filtered(P0, sharma, 5)
+    found["radars, straight"], found["radars, manoeuvring"] = radars(False), radars(True)
+    ferry = positions(1.0, 0.05, (3.0, 4.0))
+    found["navigation exact"] = steady(ferry)
+    for sigma in (1.0, 3.0):
+        for seconds in (0.0, 60.0):
+            model = ferry._replace(shared=sigma, decay=float(np.exp(-1.0 / seconds)) if seconds else 0.0)
+            word = f"over {seconds:g} s" if seconds else "white"
+            found[f"navigation {sigma:g} m, {word}"] = steady(model, 400)
+    return found
+
+
+def in_position(tracks: Tracks) -> Tracks:
+    """The tracks' positions alone."""
+    B, N, n, _ = tracks.P.shape
+    J = tracks.J.reshape(B, N, n, N, n)[:, :, ::2, :, ::2]
+    return Tracks(tracks.P[..., ::2, ::2], J.reshape(B, N * n // 2, -1))
+
+
+def outcome(rule: Fuser, tracks: Tracks, best: Floats, rng: np.random.Generator, runs: int) -> Floats:
+    """Reported and true variance of position relative to the optimum's (mean), excess (largest): (3, groups)."""
+    B, N, n, _ = tracks.P.shape
+    several = []
+    for _ in range(GROUPS):
+        error, claimed, _, constant = expected(
+            rule, tracks.P, tracks.J, draws(rng, (N - 1) * n, max(1, runs // GROUPS // B))
+        )
+        variances = (np.trace(A[:, ::2, ::2], axis1=1, axis2=2) for A in (claimed, error))
+        several.append([*((v / best).mean() for v in variances), excess(error, claimed).max()])
+        if constant:
+            break
+    return np.array(several).T
+
+
+def run(run: Run) -> Result:
+    rules = (
+        fuser("naive"),
+        fuser("ci"),
+        replace(fuser("bci"), label=OWN_BOUND),
+        fuser("bci:max_correlation=0.5"),
+        fuser("ici"),
+        fuser("hmd-ga"),
+        *run.rules,
+    )
+    cases = scenarios()
+    rows: dict[str, list[Row]] = {"correlation": [], "reported": [], "true": [], "excess": []}
+    heads = ("reported variance of position / optimum", "true variance of position / optimum", "excess")
+    for number, (name, tracks) in enumerate(cases.items()):
+        bound = float(largest_correlation(tracks.J, tracks.P).max())
+        _, N, n, _ = tracks.P.shape
+        own = np.stack([tracks.J[:, i * n : (i + 1) * n, i * n : (i + 1) * n] for i in range(N)], axis=1)
+        place = in_position(tracks)
+        rows["correlation"] += [
+            Row(name, "correlation: largest", None, bound),
+            Row(name, "correlation: largest in position", None, float(largest_correlation(place.J, place.P).max())),
+            Row(name, "correlation: a track's own true / reported", None, float(excess(own, tracks.P).max())),
+        ]
+        best = np.trace(optimal(tracks.J, n)[:, ::2, ::2], axis1=1, axis2=2)
+        for rule in rules:
+            if rule.label == OWN_BOUND:
+                rule = replace(rule, options=(("max_correlation", min(1.0, bound)),))
+            answer = outcome(rule, tracks, best, run.rng(number), run.runs)
+            for which, head, samples in zip(("reported", "true", "excess"), heads, answer, strict=True):
+                error = float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None
+                rows[which].append(Row(name, f"{head}: {rule.label}", None, float(samples.mean()), error))
+        run.progress((number + 1) / len(cases), name)
+    return Result(
+        tuple(row for group in rows.values() for row in group), _notes(rows), partial(_draw, rows), (12.0, 7.5)
+    )
+
+
+def _notes(rows: dict[str, list[Row]]) -> tuple[str, ...]:
+    return ()
+
+
+def _draw(rows: dict[str, list[Row]], figure: Any) -> None:
+    return None
+
+
+STUDIES = (
+    Study(
+        name="track-correlation",
+        title="How correlated local tracks are, and what each rule makes of it",
+        source="our own",
+        about=__doc__ or "",
+        run=run,
+        runs=20_000,
+        quick=1_000,
+        seconds=20.0,
+        takes_rules=True,
+    ),
+)
