@@ -84,8 +84,8 @@ def joint_of(P: Floats, K: Floats) -> Floats:
     """J (B, N n, N n) of covariances P and the correlations K (B, N n, N n), identity blocks on its diagonal, of the
     errors whitened by Cholesky factors."""
     B, N, n, _ = P.shape
-    L = np.linalg.cholesky(P)
-    blocks = L[:, :, None] @ K.reshape(B, N, n, N, n).swapaxes(2, 3) @ transpose(L)[:, None]
+    L = np.asarray(np.linalg.cholesky(P))
+    blocks = np.matmul(L[:, :, None], K.reshape(B, N, n, N, n).swapaxes(2, 3)) @ L.swapaxes(-1, -2)[:, None]
     return np.asarray(blocks.swapaxes(2, 3).reshape(B, N * n, N * n))
 
 
@@ -131,15 +131,15 @@ def _fused(rule: Fuser, d: Floats, P: Floats) -> tuple[Floats, Floats]:
         fused = rule(means.reshape(N, n, -1), covariances.reshape(N, n, n, -1))
         g[part] = fused.mean.reshape(n, count, M).swapaxes(0, 1)
         reported[part] = fused.covariance.reshape(n, n, count, M).transpose(2, 0, 1, 3)
-    if not np.isfinite(g).all():
-        raise ValueError(f"rule {rule.label!r} refuses a fusion of the study")
     return g, reported
 
 
 def expected(rule: Fuser, P: Floats, J: Floats, z: Floats) -> Outcome:
-    """`rule` told P (B, N, n, n), on errors of joint covariance J, by the draws z ((N - 1) n, M)."""
+    """`rule` told P (B, N, n, n), on errors of joint covariance J, by the draws z ((N - 1) n, M).
+
+    Fusions that the rule refuses (sampled ones of means far apart) are left out; ValueError if they are over 5 %.
+    """
     B, N, n, _ = P.shape
-    M = z.shape[1]
     H = _differences(N, n)
     D, cross = H @ J @ H.T, J[:, :n] @ H.T  # E[d d'], E[e_1 d']
     values, V = np.linalg.eigh(D)
@@ -147,8 +147,14 @@ def expected(rule: Fuser, P: Floats, J: Floats, z: Floats) -> Outcome:
     scale = np.where(values > 1e-10 * values[:, -1:], 1.0 / np.maximum(root, 1e-150), 0.0)
     inverse_root = V * scale[:, None]  # R^-T of D = R R', R = V root
     d = (V * root[:, None]) @ z
-    g, reported = _fused(rule, d.reshape(B, N - 1, n, M), P)
-    S = g @ z.T / M
+    g, reported = _fused(rule, d.reshape(B, N - 1, n, -1), P)
+    good = np.asarray(np.isfinite(g).all(axis=1))  # (B, M)
+    if good.mean() < 0.95:
+        raise ValueError(f"rule {rule.label!r} refuses {100 * (1 - good.mean()):.0f} % of these fusions")
+    g = np.where(good[:, None], g, 0.0)
+    reported = np.where(good[:, None, None], reported, 0.0)
+    count = good.sum(axis=1)[:, None, None]
+    S = g @ z.T / count
     shared = cross @ inverse_root @ transpose(S)
     gain = S @ transpose(inverse_root)
     constant = bool(
@@ -157,8 +163,8 @@ def expected(rule: Fuser, P: Floats, J: Floats, z: Floats) -> Outcome:
     )
     others = gain.reshape(B, n, N - 1, n).swapaxes(1, 2)
     gains = np.concatenate([np.eye(n) - others.sum(axis=1, keepdims=True), others], axis=1)
-    true = J[:, :n, :n] + shared + transpose(shared) + g @ transpose(g) / M
-    return Outcome(0.5 * (true + transpose(true)), reported.mean(axis=-1), gains, constant)
+    true = J[:, :n, :n] + shared + transpose(shared) + g @ transpose(g) / count
+    return Outcome(0.5 * (true + transpose(true)), reported.sum(axis=-1) / count, gains, constant)
 
 
 def mse(gains: Floats, J: Floats) -> Floats:

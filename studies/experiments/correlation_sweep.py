@@ -18,7 +18,8 @@ mean; the notes give the largest of all pairs.
   for the rule's own mean gain and by random steps. The K found is judged with 2,048 fresh draws. This is a lower bound
   of the worst case.
 * Sampled rules (2,000 samples, alpha = 1) are slow: a fiftieth of the pairs, 32 draws, no search beyond the two
-  starts, up to three dimensions; their sampling error, some per cent, is in the excess.
+  starts, up to three dimensions; their sampling error, some per cent, is in the excess. Fusions that they refuse
+  (means so far apart that too few samples count; below 1 %) are left out.
 * Three sources: rules that fuse them at once; for data-dependent ones a lower bound from the naive rule's worst case
   and two turns towards their own.
 
@@ -183,8 +184,8 @@ def study(task: Task) -> Found:
     if N > 2:
         return Found(worst_found, none, none, none)
     several = 1 if sampled else SEVERAL if known is not None else 2
-    K = correlations(np.random.default_rng([seed, n, 2]), SEVERAL * runs, n).reshape(SEVERAL, runs, n, n)
-    K = K[:several, : len(P)].reshape(-1, n, n)
+    every = correlations(np.random.default_rng([seed, n, 2]), SEVERAL * runs, n).reshape(SEVERAL, runs, n, n)
+    K = every[:several, : len(P)].reshape(-1, n, n)
     P = np.tile(P, (several, 1, 1, 1))
     answers = []
     for rho in SHOWN:
