@@ -8,8 +8,8 @@ with gains K_i of Kalman filters that run alone,
     J <- A J A' + B (1 1' x Q) B' + K R K',    A = (I - K H)(I x F), B = I - K H   (block-diagonal K, H)
 
 (Bar-Shalom's recursion for cross-covariances), a common measurement error being carried along as a state. A test
-compares them with simulated filters. Targets move in the plane with nearly constant velocity; every sensor measures the
-position once in a period T = 1 s, unless said.
+compares them with simulated filters. Targets move in the plane with nearly constant velocity; all sensors measure the
+position at the same times, T = 1 s apart, unless said.
 
 * Process noise: the same target seen by two or three sensors that share nothing else, in steady state. Index: q T^3 /
   sigma^2 with the noise intensity q and the first sensor's standard deviation; 1:3 are the sensors' deviations.
@@ -315,7 +315,7 @@ def run(run: Run) -> Result:
                 rows[which].append(Row(name, f"{head}: {rule.label}", None, float(samples.mean()), error))
         run.progress((number + 1) / len(cases), name)
     return Result(
-        tuple(row for group in rows.values() for row in group), _notes(rows), partial(_draw, rows), (12.0, 7.5)
+        tuple(row for group in rows.values() for row in group), _notes(rows), partial(_draw, rows), (12.0, 8.5)
     )
 
 
@@ -386,17 +386,20 @@ def _draw(rows: dict[str, list[Row]], figure: Any) -> None:
     below.set_title("A common prior is forgotten", fontsize=10)
     below.legend(fontsize=8)
     names = list(dict.fromkeys(row.name for row in rows["excess"]))
+    rules = list(dict.fromkeys(row.quantity.partition(": ")[2] for row in rows["excess"]))
     for row in rows["excess"]:
         rule = row.quantity.partition(": ")[2]
+        height = names.index(row.name) + 0.7 * (rules.index(rule) / (len(rules) - 1) - 0.5)
         marker = {"bci": "D", "bci:max_correlation=0.5": "x"}.get(rule, "o")
         label = rule if row.name == names[0] else None
-        right.plot(row.ours, names.index(row.name), marker, color=pictures.colour(rule), ms=5, label=label)
+        right.plot(row.ours, height, marker, color=pictures.colour(rule), ms=4, label=label)
     right.axvline(1.0, color="#000000", lw=0.8)
     right.set_xscale("log")
     right.xaxis.set_major_formatter("{x:g}")
     right.set_yticks(range(len(names)), names, fontsize=8)
     right.set_ylim(len(names) - 0.5, -0.5)
-    right.grid(axis="y", lw=0.3)
+    for k in range(1, len(names)):
+        right.axhline(k - 0.5, color="#cccccc", lw=0.5)
     right.set(xlabel="excess: largest eigenvalue of MSE / reported")
     right.set_title("What the rules make of it", fontsize=10)
     right.legend(fontsize=8, loc="lower right")
