@@ -233,8 +233,8 @@ def run(run: Run) -> Result:
         for rule in rules
         for k, rho in enumerate(BOUNDS)
     ]
-    labels = [rule.label for rule in rules]
-    return Result(tuple(row for row in rows if row), _notes(found, rules), partial(_draw, found, labels), (12.0, 6.0))
+    kept = tuple(row for row in rows if row)
+    return Result(kept, _notes(found, rules), partial(_draw, kept), (12.0, 6.0))
 
 
 Answers = dict[tuple[str, int, int], Found]
@@ -267,20 +267,23 @@ def _notes(found: Answers, rules: Sequence[Fuser]) -> tuple[str, ...]:
     return tuple(notes)
 
 
-def _draw(found: Answers, labels: Sequence[str], figure: Any) -> None:
+def _draw(rows: Sequence[Row], figure: Any) -> None:
+    value = {(row.name, row.quantity): row.ours for row in rows}
     left, right = figure.subplots(1, 2, width_ratios=(3, 2))
     seen: list[str] = []
-    for label in labels:
+    for label in dict.fromkeys(row.name for row in rows):
         colour = pictures.colour(label)
         kind = seen.count(colour) % 3
         seen.append(colour)
-        n = [one for one in DIMENSIONS if (label, one, 2) in found]
-        value = [found[label, one, 2].worst[-1].mean() for one in n]
         look: dict[str, Any] = {"color": colour, "marker": "osD"[kind]}
-        left.plot(n, value, ("-", "--", ":")[kind], ms=4, label=label, **look)
-        if max(n) >= 4:
-            one = found[label, 4, 2]
-            right.plot(np.exp(one.reported[-1].mean()), one.average[-1].mean(), "", ms=8, **look)
+        quantity = f"worst excess, correlation up to {BOUNDS[-1]:g}: n = "
+        n = [one for one in DIMENSIONS if (label, f"{quantity}{one}") in value]
+        worst_found = [value[label, f"{quantity}{one}"] for one in n]
+        left.plot(n, worst_found, ("-", "--", ":")[kind], ms=4, label=label, **look)
+        size = value.get((label, "reported size / optimum, random correlation: n = 4, up to 0.9"))
+        mean = value.get((label, "mean excess, random correlation up to 0.9: n = 4"))
+        if size is not None:
+            right.plot(size, mean, "", ms=8, **look)
     for axes in (left, right):
         axes.axhline(1.0, color="#000000", lw=0.8)
         axes.set_yscale("log")

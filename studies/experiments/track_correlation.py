@@ -2,13 +2,9 @@
 choose the bound of `bci`, `max_correlation`, with a reason.
 
 That bound is on the largest singular value of L1^-1 P12 L2^-T, P1 = L1 L1' and P2 = L2 L2' as the tracks report them:
-the largest canonical correlation, over all combinations of position and velocity. Joint error covariances are exact:
-with gains K_i of Kalman filters that run alone,
-
-    J <- A J A' + B (1 1' x Q) B' + K R K',    A = (I - K H)(I x F), B = I - K H   (block-diagonal K, H)
-
-(Bar-Shalom's recursion for cross-covariances), a common measurement error being carried along as a state. A test
-compares them with simulated filters. Targets move in the plane with nearly constant velocity; all sensors measure the
+the largest canonical correlation, over all combinations of position and velocity. Joint error covariances are exact, by
+Bar-Shalom's recursion for cross-covariances (`studies/local_tracks.py`); a test compares them with simulated filters.
+Targets move in the plane with nearly constant velocity; all sensors measure the
 position at the same times, T = 1 s apart, unless said.
 
 * Process noise: the same target seen by two or three sensors that share nothing else, in steady state. Index: q T^3 /
@@ -37,11 +33,10 @@ scenario's own correlation (at most 1). `hmd-ga`: means over the difference of t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -50,94 +45,13 @@ from schemas import Ecef
 from sensor_clients.scenarios.three_radars import DURATION, RADAR, RADARS, TRACKER, true_states
 from studies import pictures
 from studies.correlation import draws, excess, expected, independent, largest_correlation, mse, optimal
+from studies.local_tracks import Model, Tracks, alike, blocks, filtered, planar, positions, steady
 from studies.rules import Fuser, fuser
 from studies.study import Floats, Result, Row, Run, Study
 
-PLACE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
-"""Position of a state x, vx, y, vy."""
 OWN_BOUND = "bci"
 GROUPS = 10
 """Independent sets of draws, for the standard error."""
-
-
-class Tracks(NamedTuple):
-    """N tracks of one target, B times over: reported P (B, N, n, n), joint error covariance J (B, N n, N n)."""
-
-    P: Floats
-    J: Floats
-
-
-class Model(NamedTuple):
-    """F, Q (n, n) as filters have it; H (..., N, d, n), R (N, d, d); true: the process noise there is (None: Q);
-    shared: standard deviation of a common measurement error, and its correlation from one scan to the next."""
-
-    F: Floats
-    Q: Floats
-    H: Floats
-    R: Floats
-    true: Floats | None = None
-    shared: float = 0.0
-    decay: float = 0.0
-
-
-def planar(T: float, q: float) -> tuple[Floats, Floats]:
-    """F and Q (4, 4) of nearly constant velocity in the plane: x, vx, y, vy."""
-    F, Q = np.array([[1.0, T], [0.0, 1.0]]), np.array([[q * T**3 / 3, q * T**2 / 2], [q * T**2 / 2, q * T]])
-    return np.kron(np.eye(2), F), np.kron(np.eye(2), Q)
-
-
-def positions(T: float, q: float, sigmas: Sequence[float]) -> Model:
-    """Sensors of position with these standard deviations."""
-    return Model(*planar(T, q), np.tile(PLACE, (len(sigmas), 1, 1)), np.stack([s**2 * np.eye(2) for s in sigmas]))
-
-
-def blocks(A: Floats) -> Floats:
-    """Block-diagonal (B, N a, N b) of A (B, N, a, b)."""
-    B, N, a, b = A.shape
-    out = np.zeros((B, N, a, N, b))
-    out[:, range(N), :, range(N)] = A.swapaxes(0, 1)
-    return out.reshape(B, N * a, N * b)
-
-
-def filtered(start: Tracks, model: Model, steps: int, H: Floats | None = None) -> Tracks:
-    """After `steps` predictions and updates; H (steps, B, N, d, n) where it changes."""
-    P, (B, size, _) = start.P, start.J.shape
-    N, n, d = P.shape[1], P.shape[2], model.R.shape[1]
-    J = np.zeros((B, size + d, size + d))
-    J[:, :size, :size] = start.J
-    J[:, size:, size:] = model.shared**2 * np.eye(d)
-    Q = model.Q if model.true is None else model.true
-    common = np.zeros((size + d, size + d))
-    common[:size, :size] = np.tile(Q, (N, N))
-    common[size:, size:] = (1.0 - model.decay**2) * model.shared**2 * np.eye(d)
-    move = np.zeros_like(common)
-    move[:size, :size] = np.kron(np.eye(N), model.F)
-    move[size:, size:] = model.decay * np.eye(d)
-    R = model.R + model.shared**2 * np.eye(d)
-    A = np.broadcast_to(np.eye(size + d), J.shape).copy()
-    for k in range(steps):
-        h = np.broadcast_to(model.H if H is None else H[k], (B, N, d, n))
-        P = model.F @ P @ model.F.T + model.Q
-        K = P @ h.swapaxes(-1, -2) @ np.linalg.inv(h @ P @ h.swapaxes(-1, -2) + R)
-        P = P - K @ h @ P
-        P = 0.5 * (P + P.swapaxes(-1, -2))
-        A[:, :size, :size] = blocks(np.eye(n) - K @ h)
-        A[:, :size, size:] = K.reshape(B, size, d)
-        J = A @ (move @ J @ move.T + common) @ A.swapaxes(1, 2)
-        J[:, :size, :size] += blocks(K @ model.R @ K.swapaxes(-1, -2))
-    J = J[:, :size, :size]
-    return Tracks(P, 0.5 * (J + J.swapaxes(1, 2)))
-
-
-def alike(P: Floats, N: int, true: Floats | None = None) -> Tracks:
-    """N copies of one estimate that reports P (n, n)."""
-    return Tracks(np.tile(P, (1, N, 1, 1)), np.tile(P if true is None else true, (1, N, N)))
-
-
-def steady(model: Model, steps: int = 150) -> Tracks:
-    """The filters' tracks once their start is forgotten."""
-    N, n = model.H.shape[0], len(model.F)
-    return filtered(alike(100.0 * np.mean(model.R[:, 0, 0]) * np.eye(n), N), model, steps)
 
 
 def constant_gain(rule: Fuser, P: Floats) -> tuple[Floats, Floats]:
@@ -311,8 +225,9 @@ def run(run: Run) -> Result:
                 rule = replace(rule, options=(("max_correlation", min(1.0, bound)),))
             answer = outcome(rule, tracks, best, run.rng(number), run.runs)
             for which, head, samples in zip(("reported", "true", "excess"), heads, answer, strict=True):
-                error = float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else None
-                rows[which].append(Row(name, f"{head}: {rule.label}", None, float(samples.mean()), error))
+                error = float(samples.std(ddof=1) / np.sqrt(len(samples))) if len(samples) > 1 else 0.0
+                quantity = f"{head}: {rule.label}"
+                rows[which].append(Row(name, quantity, None, float(samples.mean()), error if error > 1e-9 else None))
         run.progress((number + 1) / len(cases), name)
     return Result(
         tuple(row for group in rows.values() for row in group), _notes(rows), partial(_draw, rows), (12.0, 8.5)
@@ -412,9 +327,9 @@ STUDIES = (
         source="our own",
         about=__doc__ or "",
         run=run,
-        runs=20_000,
-        quick=1_000,
-        seconds=20.0,
+        runs=4_000,
+        quick=400,
+        seconds=5.0,
         takes_rules=True,
     ),
 )

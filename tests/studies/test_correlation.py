@@ -1,4 +1,5 @@
-"""Fusion of errors with known joint distributions (`studies/correlation.py`) and the two studies made of it."""
+"""Fusion of errors with known joint distributions (`studies/correlation.py`), local tracks' joint errors
+(`studies/local_tracks.py`), and the two studies made of them."""
 
 from __future__ import annotations
 
@@ -26,6 +27,7 @@ from studies.correlation import (
 )
 from studies.experiments import correlation_sweep as sweep
 from studies.experiments import track_correlation as local
+from studies.local_tracks import Model, Tracks, alike, filtered, planar, positions, steady
 from studies.rules import Fuser, fuser
 from studies.study import Floats, Result, Row, Run, Study
 
@@ -165,7 +167,7 @@ def test_a_rule_of_ones_own_is_judged_exactly_too(monkeypatch: pytest.MonkeyPatc
     assert all(row.ours <= 1 + 1e-9 for row in rows)
 
 
-def simulated(model: local.Model, start: local.Tracks, steps: int, M: int, seed: int) -> tuple[Floats, Floats]:
+def simulated(model: Model, start: Tracks, steps: int, M: int, seed: int) -> tuple[Floats, Floats]:
     """Errors (N, n, M) of Kalman filters of their own, and the covariances (N, n, n) that they report."""
     rng = np.random.default_rng(seed)
     N, n, d = model.H.shape[0], len(model.F), model.R.shape[1]
@@ -189,26 +191,26 @@ def simulated(model: local.Model, start: local.Tracks, steps: int, M: int, seed:
     return np.stack([one.mean - truth for one in filters]), np.stack([one.covariance[..., 0] for one in filters])
 
 
-FERRY = local.positions(1.0, 0.05, (3.0, 4.0))
+FERRY = positions(1.0, 0.05, (3.0, 4.0))
 
 
 @pytest.mark.parametrize(
     ("model", "steps"),
     [
-        (local.positions(1.0, 0.1, (1.0, 3.0)), 25),
-        (local.positions(1.0, 10.0, (1.0, 2.0, 3.0)), 10),
-        (local.positions(1.0, 0.0, (1.0, 1.0)), 5),
-        (local.positions(1.0, 0.1, (1.0, 1.0))._replace(true=np.zeros((4, 4))), 15),
+        (positions(1.0, 0.1, (1.0, 3.0)), 25),
+        (positions(1.0, 10.0, (1.0, 2.0, 3.0)), 10),
+        (positions(1.0, 0.0, (1.0, 1.0)), 5),
+        (positions(1.0, 0.1, (1.0, 1.0))._replace(true=np.zeros((4, 4))), 15),
         (FERRY._replace(shared=3.0), 20),
         (FERRY._replace(shared=3.0, decay=0.95), 20),
     ],
     ids=["two", "three", "prior", "straight", "white", "coloured"],
 )
-def test_joint_covariances_are_those_of_simulated_filters(model: local.Model, steps: int) -> None:
+def test_joint_covariances_are_those_of_simulated_filters(model: Model, steps: int) -> None:
     N, M = len(model.H), 20_000
-    start = local.alike(np.diag([4.0, 1.0, 4.0, 1.0]), N)
+    start = alike(np.diag([4.0, 1.0, 4.0, 1.0]), N)
     e, reported = simulated(model, start, steps, M, seed=3)
-    found = local.filtered(start, model, steps)
+    found = filtered(start, model, steps)
     np.testing.assert_allclose(found.P[0], reported, rtol=1e-9)
     e = e.reshape(-1, M)
     products = e[:, None] * e[None]
@@ -219,17 +221,17 @@ def test_joint_covariances_are_those_of_simulated_filters(model: local.Model, st
 def test_a_common_prior_fades_as_in_closed_form() -> None:
     """A constant, P0 = 1, R = 4: after k measurements P = 1 / (1 + k / 4), P12 = P^2 / P0, so the correlation is P."""
     one = np.ones((1, 1))
-    model = local.Model(one, 0 * one, np.ones((2, 1, 1)), np.full((2, 1, 1), 4.0))
+    model = Model(one, 0 * one, np.ones((2, 1, 1)), np.full((2, 1, 1), 4.0))
     for k in (1, 3, 10):
-        tracks = local.filtered(local.alike(one, 2), model, k)
+        tracks = filtered(alike(one, 2), model, k)
         assert largest_correlation(tracks.J, tracks.P)[0] == pytest.approx(1 / (1 + k / 4), rel=1e-12)
 
 
 def test_steady_states_are_steady_and_forget_their_start() -> None:
-    for model in (local.positions(1.0, 0.001, (1.0, 3.0)), local.positions(1.0, 10.0, (1.0, 1.0))):
-        first, second = local.steady(model), local.steady(model, 300)
+    for model in (positions(1.0, 0.001, (1.0, 3.0)), positions(1.0, 10.0, (1.0, 1.0))):
+        first, second = steady(model), steady(model, 300)
         np.testing.assert_allclose(first.J, second.J, rtol=1e-6)
-    memory = local.positions(1.0, 0.1, (1.0, 1.0))
+    memory = positions(1.0, 0.1, (1.0, 1.0))
     for rule, bound in (("naive", 0.0), ("ci", 0.5), ("ci", 1.0)):
         first, second = local.remembered(memory, rule, bound), local.remembered(memory, rule, bound, 120)
         np.testing.assert_allclose(first.J, second.J, rtol=1e-6)
@@ -239,14 +241,14 @@ def test_memory_and_feedback_are_those_of_simulated_filters() -> None:
     """Memory: CI of two local tracks and of the last result with it. Feedback: both filters go on from the CI."""
     M, steps = 20_000, 8
     rng = np.random.default_rng(4)
-    model = local.positions(1.0, 0.1, (1.0, 2.0))
+    model = positions(1.0, 0.1, (1.0, 2.0))
 
     def ci(first: kalman.Estimate, second: kalman.Estimate) -> kalman.Estimate:
         fused = fuser("ci")(np.stack([first.mean, second.mean]), np.stack([first.covariance, second.covariance]))
         return kalman.Estimate(fused.mean, fused.covariance)
 
     for feedback in (False, True):
-        P0 = local.steady(model).P[0, 0]
+        P0 = steady(model).P[0, 0]
         start = kalman.Estimate(np.linalg.cholesky(P0) @ rng.standard_normal((4, M)), np.repeat(P0[..., None], M, -1))
         truth, tracks, last = np.zeros((4, M)), [start, start], start
         for _ in range(steps):
@@ -271,7 +273,7 @@ def test_radars_agree_with_simulated_cubature_filters(manoeuvring: bool) -> None
     """Range and azimuth taken as they are, not linearised: the largest correlation of one pair, by Monte Carlo."""
     rng, M = np.random.default_rng(6), 1500
     where = local.sightings()[:, 0]  # (K, 2, 2)
-    F, Q = local.planar(RADAR.period, TRACKER.motion.q)
+    F, Q = planar(RADAR.period, TRACKER.motion.q)
     model = RangeAzimuth(RADAR.sigma_range, RADAR.sigma_azimuth)
     R = np.diag([RADAR.sigma_range**2, RADAR.sigma_azimuth**2])
     speed = (where[1, 0] - where[0, 0]) / RADAR.period
