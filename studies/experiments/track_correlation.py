@@ -4,8 +4,8 @@ choose the bound of `bci`, `max_correlation`, with a reason.
 That bound is on the largest singular value of L1^-1 P12 L2^-T, P1 = L1 L1' and P2 = L2 L2' as the tracks report them:
 the largest canonical correlation, over all combinations of position and velocity. Joint error covariances are exact, by
 Bar-Shalom's recursion for cross-covariances (`studies/local_tracks.py`); a test compares them with simulated filters.
-Targets move in the plane with nearly constant velocity; all sensors measure the
-position at the same times, T = 1 s apart, unless said.
+Targets move in the plane with nearly constant velocity; all sensors measure the position at the same times, T = 1 s
+apart, unless said.
 
 * Process noise: the same target seen by two or three sensors that share nothing else, in steady state. Index: q T^3 /
   sigma^2 with the noise intensity q and the first sensor's standard deviation; 1:3 are the sensors' deviations.
