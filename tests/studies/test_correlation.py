@@ -230,11 +230,11 @@ def test_a_common_prior_fades_as_in_closed_form() -> None:
 def test_steady_states_are_steady_and_forget_their_start() -> None:
     for model in (positions(1.0, 0.001, (1.0, 3.0)), positions(1.0, 10.0, (1.0, 1.0))):
         first, second = steady(model), steady(model, 190)
-        np.testing.assert_allclose(first.J, second.J, rtol=1e-6)
+        np.testing.assert_allclose(first.J, second.J, rtol=1e-6, atol=1e-9)
     memory = positions(1.0, 0.1, (1.0, 1.0))
     for rule, bound in (("naive", 0.0), ("ci", 0.5)):
         first, second = local.remembered(memory, rule, bound), local.remembered(memory, rule, bound, 75)
-        np.testing.assert_allclose(first.J, second.J, rtol=1e-6)
+        np.testing.assert_allclose(first.J, second.J, rtol=1e-6, atol=1e-9)
 
 
 def test_memory_and_feedback_are_those_of_simulated_filters() -> None:
