@@ -3,7 +3,7 @@
 Errors e = (e_1 ... e_N) of N sources have the joint covariance J. A rule gives x_1 + g(d) with d = (x_2 - x_1, ...
 x_N - x_1), so its error is e_1 + g(d); with E[e_1 | d] = B d,
 
-    MSE = P_1 + B E[d g'] + E[g d'] B' + E[g g']
+    MSE = P_1 - B E[d d'] B' + E[(B d + g)(B d + g)']
 
 and only d is drawn. The draws are whitened (mean square exactly I), so that the MSE of a rule whose gain does not
 depend on d is exact, and so is the mean covariance of one that is quadratic in d. A rule's excess is the largest
@@ -155,7 +155,6 @@ def expected(rule: Fuser, P: Floats, J: Floats, z: Floats) -> Outcome:
     reported = np.where(good[:, None, None], reported, 0.0)
     count = good.sum(axis=1)[:, None, None]
     S = g @ z.T / count
-    shared = cross @ inverse_root @ transpose(S)
     gain = S @ transpose(inverse_root)
     constant = bool(
         np.allclose(g, gain @ d, rtol=1e-6, atol=1e-6 * np.abs(d).max())
@@ -163,7 +162,9 @@ def expected(rule: Fuser, P: Floats, J: Floats, z: Floats) -> Outcome:
     )
     others = gain.reshape(B, n, N - 1, n).swapaxes(1, 2)
     gains = np.concatenate([np.eye(n) - others.sum(axis=1, keepdims=True), others], axis=1)
-    true = J[:, :n, :n] + shared + transpose(shared) + g @ transpose(g) / count
+    known = cross @ inverse_root  # E[e_1 | z] = known z
+    seen = np.where(good[:, None], known @ z + g, 0.0)
+    true = J[:, :n, :n] - known @ transpose(known) + seen @ transpose(seen) / count
     return Outcome(0.5 * (true + transpose(true)), reported.sum(axis=-1) / count, gains, constant)
 
 

@@ -251,7 +251,7 @@ def _row(found: Answers, rule: Fuser, n: int, quantity: str, which: str, k: int,
     if which in ("reported", "true"):
         value = float(np.exp(value))
         error *= value
-    return Row(rule.label, quantity, None, value, error if error > 1e-6 else None)
+    return Row(rule.label, quantity, None, value, error if error > 1e-5 else None)
 
 
 def _notes(found: Answers, rules: Sequence[Fuser]) -> tuple[str, ...]:
