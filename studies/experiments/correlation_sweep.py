@@ -323,7 +323,7 @@ STUDIES = (
         run=run,
         runs=400,
         quick=8,
-        seconds=75.0,
+        seconds=70.0,
         takes_rules=True,
     ),
 )
