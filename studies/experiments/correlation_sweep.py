@@ -213,10 +213,8 @@ def run(run: Run) -> Result:
     ]
     at_once = [rule for rule in rules if not rule.rule or (RULES[rule.rule].n_way and rule.rule not in SAMPLED)]
     tasks += [Task(run.seed, run.runs, 2, 3, rule) for rule in at_once]
-    far = [task for task in tasks if task.rule.function is None]
-    near = [task for task in tasks if task.rule.function is not None]  # a function from a file: in this process
-    answers = [*run.map(study, far, "rule by rule"), *map(study, near)]
-    found = {(task.rule.label, task.n, task.N): one for task, one in zip([*far, *near], answers, strict=True)}
+    answers = run.map(study, tasks, "rule by rule")
+    found = {(task.rule.label, task.n, task.N): one for task, one in zip(tasks, answers, strict=True)}
     rows = []
     for k, rho in enumerate(BOUNDS):
         head = f"worst excess, correlation up to {rho:g}"

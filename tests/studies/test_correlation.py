@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from functools import cache
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ from studies.correlation import (
 from studies.experiments import correlation_sweep as sweep
 from studies.experiments import track_correlation as local
 from studies.local_tracks import Model, Tracks, alike, filtered, planar, positions, steady
-from studies.rules import Fuser, fuser
+from studies.rules import fuser
 from studies.study import Floats, Result, Row, Run, Study
 
 CONSTANT = ("naive", "ci", "bci:max_correlation=0.5", "fast-ci", "ffcc", "ici", "ei")
@@ -153,16 +154,14 @@ def test_the_others_are_too_sure_and_more_so_in_more_dimensions() -> None:
     np.testing.assert_allclose(swept("naive", 2).reported[0], 0.0, atol=1e-9)
 
 
-def half(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
-    """The average of the means, under the average of the covariances: conservative whatever the correlation."""
-    return means.mean(axis=0), covariances.mean(axis=0)
-
-
-def test_a_rule_of_ones_own_is_judged_exactly_too(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_rule_of_ones_own_is_judged_exactly_too(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The average of the means under that of the covariances is conservative whatever the correlation; the other
+    process finds the function again by its file."""
     monkeypatch.setattr(sweep, "RULE_NAMES", ("naive", "ci", "fast-ci", "hmd-ga"))
-    local_half: Fuser = Fuser("half", function=lambda means, covariances: half(means, covariances))  # cannot be sent
-    result = sweep.run(Run(8, 1, rules=(local_half,), jobs=2))
-    rows = [row for row in result.rows if row.name == "half" and row.quantity.startswith("worst")]
+    own = tmp_path / "own.py"
+    own.write_text("def half(means, covariances):\n    return means.mean(axis=0), covariances.mean(axis=0)\n")
+    result = sweep.run(Run(8, 1, rules=(fuser(f"{own}:half"),), jobs=2))
+    rows = [row for row in result.rows if row.name == "own.half" and row.quantity.startswith("worst")]
     assert len(rows) == 3 * 6 + 3
     assert all(row.ours <= 1 + 1e-9 for row in rows)
 
