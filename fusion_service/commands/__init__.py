@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from types import ModuleType
 
+from fusion_service.commands import replay
+
 __all__ = ["COMMANDS"]
 
-COMMANDS: tuple[ModuleType, ...] = ()
+COMMANDS: tuple[ModuleType, ...] = (replay,)
 """In the order of the help; a command is called as its module, with hyphens."""
