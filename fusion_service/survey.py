@@ -65,18 +65,36 @@ class Survey:
     centres: dict[str, RecordedCentre] = field(default_factory=dict)
 
     def chosen(self, name: str | None) -> RecordedCentre | None:
-        """The centre `name`, else the only one there is, or the only one that is no replay; None where there is none
-        with a step log. `ReviewError` if it cannot be told."""
-        known = ", ".join(sorted(self.centres)) or "none"
+        """The centre `name`, else the only one with step logs, or the only one of these that is no replay; None where
+        there is none with step logs. `ReviewError` if it cannot be told."""
         if name is not None:
-            if name not in self.centres:
-                raise ReviewError(f"{self.path} holds no centre {name!r}: name one of its centres ({known})")
-            return self.centres[name] if self.centres[name].logs else None
-        logged = [one for one in self.centres.values() if one.logs]
-        first_hand = [one for one in logged if not one.replayed] or logged
+            one = self._named(name)
+            return one if one.logs else None
+        return self._only([one for one in self.centres.values() if one.logs])
+
+    def shown(self, name: str | None) -> RecordedCentre:
+        """The same, be it with step logs or without."""
+        if name is not None:
+            return self._named(name)
+        one = self._only([one for one in self.centres.values() if one.logs]) or self._only(list(self.centres.values()))
+        if one is None:
+            raise ReviewError(f"{self.path} holds no tracks of a centre: fuse it with fusion-service replay first")
+        return one
+
+    def _named(self, name: str) -> RecordedCentre:
+        if name not in self.centres:
+            raise ReviewError(f"{self.path} holds no centre {name!r}: name one of its centres ({self._known})")
+        return self.centres[name]
+
+    def _only(self, some: list[RecordedCentre]) -> RecordedCentre | None:
+        first_hand = [one for one in some if not one.replayed] or some
         if len(first_hand) > 1:
-            raise ReviewError(f"{self.path} holds several centres: choose one with --centre ({known})")
+            raise ReviewError(f"{self.path} holds several centres: choose one with --centre ({self._known})")
         return first_hand[0] if first_hand else None
+
+    @property
+    def _known(self) -> str:
+        return ", ".join(sorted(self.centres)) or "none"
 
 
 @lru_cache(maxsize=4096)
