@@ -55,7 +55,8 @@ def listing(mission: Mission, *, everything: bool = False) -> str:
     head = f"{mission.path}: centre {mission.centre.name}, {mission.steps} steps from {_utc(mission.start)}"
     left = len(lives) - len(shown)
     never = f"; {left} more were never confirmed (--all lists them)" if left else ""
-    tail = f"{len(shown)} track{'s' * (len(shown) != 1)}{never}. Ask for one: fusion-service explain {mission.path} --track NUMBER"
+    count = f"{len(shown)} track{'s' * (len(shown) != 1)}"
+    tail = f"{count}{never}. Ask for one: fusion-service explain {mission.path} --track NUMBER"
     return "\n".join([head, *_table(rows, left=(0, 5, 6)), tail])
 
 
@@ -139,7 +140,7 @@ class _Teller:
     def _distance(self, one: Happening) -> str:
         if not math.isfinite(one.low):
             return ", alone" if one.what == "kept" else ""
-        span = f"{one.low:.1f}" if one.low == one.high else f"{one.low:.1f}-{one.high:.1f}"
+        span = "-".join(dict.fromkeys((f"{one.low:.1f}", f"{one.high:.1f}")))
         gate = self.gate if one.what.startswith(("kept", "outside", "broken")) else self.new_gate
         return f", d2 {span}" + (f" of gate {gate:.1f}" if math.isfinite(gate) else "")
 

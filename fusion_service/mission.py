@@ -86,7 +86,10 @@ def read_mission(
 
     `ReviewError` where the recording, the track or the time is not as it must be.
     """
+    stop = stop or Event()
     found = survey(path, stop)
+    if stop.is_set():
+        raise ReviewError("stopped")
     mission = Mission(found.path, found.shown(centre))
     if track is not None:
         try:
@@ -97,8 +100,8 @@ def read_mission(
     reader = _Reader(mission, track, at)
     with Progress("Reading") as bar:
         for number, raw in enumerate(read(path)):
-            if stop is not None and stop.is_set():
-                break
+            if stop.is_set():
+                raise ReviewError(f"stopped after {mission.steps} steps")
             reader.take(raw)
             if number % SHOWN == 0:
                 bar.show(number / found.messages, f"{mission.steps} steps")

@@ -145,9 +145,9 @@ def run_replay(
     stop = stop or Event()
     given = None if config is None else load_config(config).centre
     found = survey(path, stop)
-    followed = found.chosen(centre)
     if stop.is_set():
         return Replay(found.path, "log", [], stopped=True)
+    followed = found.chosen(centre)
     if verify and followed is None:
         raise ReviewError(f"{path} has no step logs of a centre: there is nothing to verify")
     if not found.inputs:

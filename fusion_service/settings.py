@@ -41,10 +41,12 @@ def recordable(config: CentreConfig) -> dict[str, Any] | None:
     """The settings as a part of an event of a step log; None where they are too large, or too deep, for one."""
     plain = plain_settings(config)
     try:
+        if len(msgpack.packb(plain)) > MOST_RECORDED:
+            return None
         free_map({"config": plain})
-        return plain if len(msgpack.packb(plain)) <= MOST_RECORDED else None
     except (ValueError, TypeError, OverflowError):
         return None
+    return plain
 
 
 def nested(plain: Mapping[str, Any]) -> dict[str, Any]:
