@@ -189,9 +189,8 @@ class _Teller:
         if born is None:
             why = "when the recording of it begins"
             return [f"Track {name} was there already at {at} s, {why}."]
-        founders = [one.member for one in story.happenings if one.what == "linked" and one.first == born.first]
-        parents = self.names(member for member in founders if member is not None)
-        text = f"Track {name} was born at {self.time(born.first)} s from {parents}"
+        founders = [member for member, link in story.links.items() if link.first == born.first]
+        text = f"Track {name} was born at {self.time(born.first)} s from {self.names(founders)}"
         parent = split.other if split is not None else life.parent
         if parent is not None:
             text += f", split from track {self.label(parent)} with which it no longer agreed"
@@ -208,15 +207,14 @@ class _Teller:
         late = [one for one in story.links if story.links[one].first > story.first]
         if late:
             said.append(f"{self.names(late)} joined later.")
-        failed = [one for one in story.happenings if one.what == "broken off"]
-        for one in failed:
-            assert one.member is not None
-            said.append(f"{self.name(one.member)} was broken off at {self.time(one.first)} s: too far from the others.")
         for one in story.happenings:
-            if one.what == "took in" and one.other is not None:
-                said.append(f"It took in track {self.label(one.other)} at {self.time(one.first)} s.")
-            if one.what == "split off it:" and one.other is not None:
-                said.append(f"Track {self.label(one.other)} was split off it at {self.time(one.first)} s.")
+            at = self.time(one.first)
+            if one.what == "broken off" and one.member is not None:
+                said.append(f"{self.name(one.member)} was broken off at {at} s: too far from the others.")
+            elif one.what == "took in" and one.other is not None:
+                said.append(f"It took in track {self.label(one.other)} at {at} s.")
+            elif one.what == "split off it:" and one.other is not None:
+                said.append(f"Track {self.label(one.other)} was split off it at {at} s.")
         if story.status["coasting"]:
             said.append(f"It coasted for {story.status['coasting']} of its {story.steps} steps.")
         heavy = sorted(story.links, key=lambda one: -story.links[one].total)[:3]

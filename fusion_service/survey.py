@@ -12,6 +12,7 @@ from typing import Any
 from fusion_service.config import CentreConfig, config_hash
 from fusion_service.errors import ReviewError
 from fusion_service.recording import read
+from fusion_service.recording.columns import import_rerun
 from fusion_service.settings import known_settings, nested
 from schemas import REALM, Key, MessageError, StepLog, decode, parse_key
 
@@ -107,8 +108,13 @@ def key_of(text: str) -> Key | None:
 
 
 def survey(path: str | Path, stop: Event | None = None) -> Survey:
-    """Look through a recording once. `ReviewError`, or `FileNotFoundError`, for what is none."""
+    """Look through a recording once. `ReviewError`, or `FileNotFoundError`, for what is none, and `ReviewError` where
+    recordings cannot be read here."""
     found = Survey(Path(path))
+    try:
+        import_rerun()
+    except ImportError as error:
+        raise ReviewError(str(error)) from None
     for raw in read(path):
         if stop is not None and stop.is_set():
             break

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from centre.worlds import SECOND, START, tracks
+from centre.worlds import FRAME, SECOND, SPACE, START, info, tracks
 from flown import Flight, places, raws
 from scipy.stats import chi2
 
@@ -253,6 +253,24 @@ def test_what_the_command_cannot_do_is_told(joined: tuple[Path, Flight], tmp_pat
         assert len(errors.strip().splitlines()) == 1
     assert main(["explain", path]) == 0
     assert "3 tracks. Ask for one:" in capsys.readouterr().out
+
+
+def test_tracks_of_intensities_have_sources_alone(tmp_path: Path) -> None:
+    flight = Flight({"kind": "intensity", "coast": 3.0})
+    for name in ("r1", "r2"):
+        flight.put(info(name), 0.5)
+    for second in range(1, 8):
+        for name, weight in (("r1", 0.9), ("r2", 0.9 if second < 5 else 1e-6)):
+            message = schemas.LocalIntensity(
+                source=name, epoch=1, seq=second, sent=0, time=START + second * SECOND, space=SPACE, frame=FRAME,
+                weights=np.array([weight]), means=np.zeros((1, 4)), covariances=np.diag([9.0, 9, 1, 1])[None],
+            )  # fmt: skip
+            flight.put(message, second)
+        flight.step(second)
+    text = told(flight.record(tmp_path / "mission.rrd"), "1")
+    assert "Track 1 was born at 0.0 s from r1 and r2, and confirmed at once." in text
+    assert line(text, "r2 leaves: the source expects too little there").startswith("4.0")
+    assert "gate" not in text
 
 
 def test_without_logs_the_pictures_tell_what_they_can(joined: tuple[Path, Flight], tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import sys
 import threading
 from pathlib import Path
 from typing import Any
@@ -422,6 +423,14 @@ def test_mistakes_are_told_before_anything_is_written(mission: Path, tmp_path: P
         assert not out.exists()
     assert main(["replay", str(tmp_path / "none.rrd"), "--verify"]) == 1
     assert "no recording at" in capsys.readouterr().err
+
+
+def test_a_missing_extra_is_told_in_one_line(mission: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert main(["replay", str(mission), "--verify"]) == 1
+    errors = capsys.readouterr().err
+    assert "pip install 'track-fusion-centre[record]'" in errors
+    assert len(errors.strip().splitlines()) == 1
 
 
 def test_the_verdict_is_the_exit_code(flight: Flight, mission: Path, tmp_path: Path, capsys: Any) -> None:
