@@ -8,9 +8,5 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from fusion_service.commands import export
-
-__all__ = ["COMMANDS"]
-
-COMMANDS: tuple[ModuleType, ...] = (export,)
+from fusion_service.commands import explain, export, replay
 """In the order of the help; a command is called as its module, with hyphens."""
