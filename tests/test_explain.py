@@ -17,8 +17,7 @@ import schemas
 from fusion_service.centre import Order
 from fusion_service.cli import main
 from fusion_service.errors import ReviewError
-from fusion_service.explain import explanation, listing
-from fusion_service.mission import read_mission
+from fusion_service.explain import explanation, listing, read_mission
 from fusion_service.recording.labels import Labels
 from schemas import GlobalTracks, LocalTracks, StepLog, Truth
 

@@ -9,4 +9,8 @@ from __future__ import annotations
 from types import ModuleType
 
 from fusion_service.commands import explain, export, replay
+
+__all__ = ["COMMANDS"]
+
+COMMANDS: tuple[ModuleType, ...] = (replay, explain, export)
 """In the order of the help; a command is called as its module, with hyphens."""

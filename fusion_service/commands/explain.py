@@ -37,8 +37,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Run the command."""
     from fusion_service.errors import ReviewError
-    from fusion_service.explain import explanation, listing
-    from fusion_service.mission import read_mission
+    from fusion_service.explain import explanation, listing, read_mission, write_view
 
     if args.track is None and (args.at is not None or args.out is not None):
         raise ReviewError("--at and --out are about one track: name it with --track")
@@ -48,7 +47,5 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         return
     print(explanation(mission))
     if args.out is not None:
-        from fusion_service.track_view import write_view
-
         count = write_view(mission, args.out, stop)
         print(f"\n{count} messages of this track alone: {args.out}   (look at it: rerun {args.out})")

@@ -17,19 +17,19 @@ from pathlib import Path
 from threading import Event
 from typing import Any
 
-from fusion_service.bases import Bases
 from fusion_service.centre import StepResult
 from fusion_service.config import config_hash, load_config
 from fusion_service.errors import ReviewError
-from fusion_service.following import Clocked, Follower, Player
 from fusion_service.progress import Progress
 from fusion_service.recording import read
-from fusion_service.replay_writer import ReplayWriter
+from fusion_service.recording.steps import Step
+from fusion_service.recording.survey import RecordedCentre, Survey, key_of, survey
+from fusion_service.replay.bases import Bases
+from fusion_service.replay.following import Clocked, Follower, Player
+from fusion_service.replay.variants import variants_of
+from fusion_service.replay.verifying import Difference, differences, published_as
+from fusion_service.replay.writer import ReplayWriter
 from fusion_service.settings import plain_settings
-from fusion_service.steps import Step
-from fusion_service.survey import RecordedCentre, Survey, key_of, survey
-from fusion_service.variants import variants_of
-from fusion_service.verifying import Difference, differences, published_as
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, decode
 
 __all__ = ["Replay", "Verdict", "run_replay"]

@@ -13,13 +13,13 @@ from scipy.stats import chi2
 
 from fusion_service.config import CentreConfig, ConfigError, centre_config
 from fusion_service.errors import ReviewError
-from fusion_service.lives import Lives
+from fusion_service.explain.lives import Lives
+from fusion_service.explain.story import Story
 from fusion_service.progress import Progress
 from fusion_service.recording import RawMessage, read
 from fusion_service.recording.labels import Labels
-from fusion_service.steps import Step, Steps
-from fusion_service.story import Story
-from fusion_service.survey import RecordedCentre, key_of, survey
+from fusion_service.recording.steps import Step, Steps
+from fusion_service.recording.survey import RecordedCentre, key_of, survey
 from schemas import GlobalTracks, MessageError, StepLog, decode
 
 __all__ = ["Mission", "Refusals", "read_mission"]

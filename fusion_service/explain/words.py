@@ -10,9 +10,9 @@ import numpy as np
 
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
-from fusion_service.lives import GONE, Life
-from fusion_service.mission import Mission, Refusals
-from fusion_service.story import Happening, Link, Member, Moment, Story, local_messages
+from fusion_service.explain.lives import GONE, Life
+from fusion_service.explain.mission import Mission, Refusals
+from fusion_service.explain.story import Happening, Link, Member, Moment, Story, local_messages
 from schemas import STATUSES, LocalTracks
 from schemas.messages import COASTING, TENTATIVE
 

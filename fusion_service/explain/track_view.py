@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from fusion_service import geodesy
 from fusion_service.densities import moments
-from fusion_service.mission import Mission
+from fusion_service.explain.mission import Mission
 from fusion_service.recording import Recorder, read
-from fusion_service.survey import key_of
+from fusion_service.recording.survey import key_of
 from schemas import GlobalTracks, LocalTracks, Message, MessageError, StepLog, Truth, decode, encode
 
 __all__ = ["write_view"]

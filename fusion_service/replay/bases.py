@@ -8,9 +8,9 @@ from typing import Any, NamedTuple
 from fusion_service.centre import VERSION
 from fusion_service.config import CentreConfig, ConfigError, centre_config, config_hash
 from fusion_service.errors import ReviewError
+from fusion_service.recording.survey import RecordedCentre, Survey
+from fusion_service.replay.variants import Variant
 from fusion_service.settings import nested, plain_settings
-from fusion_service.survey import RecordedCentre, Survey
-from fusion_service.variants import Variant
 
 __all__ = ["Base", "Bases"]
 

@@ -9,8 +9,8 @@ from typing import Self
 
 from fusion_service.centre import StepResult
 from fusion_service.recording import RawMessage, Recorder
-from fusion_service.survey import key_of
-from fusion_service.verifying import published_as
+from fusion_service.recording.survey import key_of
+from fusion_service.replay.verifying import published_as
 from schemas import Message, encode, global_key
 
 __all__ = ["ReplayWriter"]

@@ -16,17 +16,17 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_service.bases import Base
 from fusion_service.centre import FusionCentre, Order, Refused, SourceFound, SourceLost, StepResult
 from fusion_service.checkpoint import CheckpointError
 from fusion_service.clock import MessageClock
 from fusion_service.config import CentreConfig, config_hash
-from fusion_service.held import Held, Input
 from fusion_service.intake import Event
 from fusion_service.intensity import IntensityCentre
-from fusion_service.steps import PATIENCE, Step, Steps
-from fusion_service.variants import Variant
-from fusion_service.verifying import Difference
+from fusion_service.recording.steps import PATIENCE, Step, Steps
+from fusion_service.replay.bases import Base
+from fusion_service.replay.held import Held, Input
+from fusion_service.replay.variants import Variant
+from fusion_service.replay.verifying import Difference
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, StepLog, digest
 from schemas.messages import TENTATIVE
 

@@ -14,9 +14,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion_service.lives import GONE
+from fusion_service.explain.lives import GONE
 from fusion_service.recording import RawMessage
-from fusion_service.steps import Step
+from fusion_service.recording.steps import Step
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks, MessageError, StepLog, decode
 from schemas.messages import BORN, BROKEN, COASTING, DELETED, GATE_FAILED, KEPT, LINKED, MERGED, SPLIT, TENTATIVE
 

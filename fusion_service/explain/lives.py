@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fusion_service.steps import Step
+from fusion_service.recording.steps import Step
 from schemas import GlobalTracks
 from schemas.messages import KEPT, TENTATIVE
 
