@@ -1,0 +1,181 @@
+"""The rows of Li-AA's Tables I and II: six ways to use two sensors, each with a Gaussian and with a SIR filter, then
+the other readings of the text; and the picture of them over time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from fusion_service import linalg
+from fusion_service.rules import fuse_last
+from fusion_service.rules.face import Fused
+from studies.feedback import Fuse, Model, Record, Scene, alone, gaussian, join, simulate, sir, sir_fused
+from studies.pictures import colour
+from studies.rules import fuser
+from studies.statistics import armse, mean
+from studies.study import Floats, Row, Run
+
+__all__ = ["draw", "records", "rows", "weight_row"]
+
+CHUNK = 50
+"""Runs of particles at a time: what fits the cache."""
+Weigh = Callable[[Floats, Floats], Floats]
+
+
+def _shares(measure: Callable[[Floats], Floats], means: Floats, covariances: Floats) -> Floats:
+    """Weights (2, B) inversely proportional to a measure of the covariances."""
+    inverse = np.stack([1.0 / measure(P) for P in covariances])
+    return np.asarray(inverse / inverse.sum(axis=0))
+
+
+def _diversity(means: Floats, covariances: Floats) -> Floats:
+    return fuse_last("aa", means, covariances, criterion="diversity").weights
+
+
+def _weighted(rule: str, weights: float | Weigh, **options: Any) -> Fuse:
+    """The rule with weights that it would not choose itself: that of sensor 1, or a function."""
+
+    def fuse(means: Floats, covariances: Floats) -> Fused:
+        if callable(weights):
+            return fuse_last(rule, means, covariances, weights(means, covariances), **options)
+        fixed = np.repeat([[weights], [1.0 - weights]], means.shape[-1], axis=1)
+        return fuse_last(rule, means, covariances, fixed, **options)
+
+    return fuse
+
+
+def _largest(means: Floats, covariances: Floats) -> Fused:
+    """CU as (8) has it: that one of the P_i + (x - x_i)(x - x_i)' whose trace is largest, weights 1/2."""
+    x = 0.5 * (means[0] + means[1])
+    d = means - x
+    U = covariances + d[:, :, None] * d[:, None]
+    first = linalg.trace(U[0]) >= linalg.trace(U[1])
+    return Fused(x, np.where(first, U[0], U[1]), np.full(means[:, 0].shape, 0.5), None)
+
+
+DIVERSITY = fuser("aa:criterion=diversity")
+FUSION: Mapping[str, Fuse | None] = {
+    "noncoop": alone,
+    "ic": None,
+    "nf": fuser("naive"),
+    "aa": DIVERSITY,
+    "ci": fuser("ci:criterion=trace"),
+    "cu": fuser("cu:criterion=trace"),
+}
+INVERSE_TRACE: Weigh = partial(_shares, linalg.trace)
+INVERSE_DET: Weigh = partial(_shares, linalg.det)
+OTHERS: Mapping[str, Fuse] = {
+    "aa bound (45)": fuser("aa:criterion=bound"),
+    "aa uniform": fuser("aa"),
+    "ci det": fuser("ci:criterion=det"),
+    "ci 1/det": _weighted("ci", INVERSE_DET),
+    "ci 1/trace": _weighted("ci", INVERSE_TRACE),
+    "ci w1 = 1/2": _weighted("ci", 0.5),
+    "cu det": fuser("cu:criterion=det"),
+    "cu largest trace (8)": _largest,
+    "cu min (9)": fuser("cu:criterion=trace,bound=min"),
+    "cu weights (40)": _weighted("cu", _diversity, criterion="trace"),
+    "cu w1 = 1/4": _weighted("cu", 0.25, criterion="trace"),
+    "cu w1 = 1": _weighted("cu", 1.0, criterion="trace"),
+}
+FUSED = ("nf", "aa", "ci", "cu")
+CLOUDS: Mapping[str, Callable[..., Record]] = {
+    "noncoop": partial(sir, joint=False),
+    "ic": partial(sir, joint=True),
+    **{name: partial(sir_fused, rule=FUSION[name], union=name == "aa") for name in FUSED},
+    "noncoop multinomial": partial(sir, joint=False, systematic=False),
+    "aa from a Gaussian": partial(sir_fused, rule=DIVERSITY),
+    "ci 1/det": partial(sir_fused, rule=OTHERS["ci 1/det"]),
+    "cu w1 = 1/4": partial(sir_fused, rule=OTHERS["cu w1 = 1/4"]),
+}
+
+
+def records(run: Run, model: Model, kind: str, exact: bool) -> dict[str, Record]:
+    """Every filter by its name, the twelve of the paper first; `kind`: the Gaussian filter's name; `exact`: where the
+    truth starts (`simulate`). The rows named after the other start have the other."""
+    sizes = [min(CHUNK, run.runs - start) for start in range(0, run.runs, CHUNK)]
+    scenes = [simulate(model, run.rng(chunk), size, exact) for chunk, size in enumerate(sizes)]
+    elsewhere = [simulate(model, run.rng(chunk, 1), size, not exact) for chunk, size in enumerate(sizes)]
+    extra = {rule.label: rule for rule in run.rules}
+    found: dict[str, list[Record]] = {}
+    for number in range(0, len(scenes), 5):
+        scene, other = (Scene(*join(some[number : number + 5])) for some in (scenes, elsewhere))
+        start = "truth from P0" if exact else "truth at mu0"
+        parts = (
+            ("", gaussian(model, scene, {**FUSION, **OTHERS, **extra})),
+            (" without feedback", gaussian(model, scene, {name: FUSION[name] for name in FUSED}, feedback=False)),
+            (f" {start}", gaussian(model, other, FUSION)),
+        )
+        for suffix, part in parts:
+            for name, record in part.items():
+                found.setdefault(f"{kind}-{name}{suffix}", []).append(record)
+        run.progress(min(1.0, (number + 5) / len(scenes)), kind)
+    work = partial(_clouds, model, run.seed)
+    for answer in run.map(work, enumerate(scenes), "SIR"):
+        for name, record in answer.items():
+            found.setdefault(f"sir-{name}", []).append(record)
+    names = [f"{one}-{name}" for one in (kind, "sir") for name in FUSION]
+    names += [f"{kind}-{label}" for label in extra]
+    return {name: Record(*join(found[name])) for name in [*names, *(name for name in found if name not in names)]}
+
+
+def _clouds(model: Model, seed: int, item: tuple[int, Scene]) -> dict[str, Record]:
+    chunk, scene = item
+    return {
+        name: cloud(model, scene, np.random.default_rng([seed, chunk, 2, number]))
+        for number, (name, cloud) in enumerate(CLOUDS.items())
+    }
+
+
+def rows(model: Model, found: Mapping[str, Record], published: Mapping[str, tuple[float, ...]]) -> list[Row]:
+    """The ARMSE of each filter."""
+    out = []
+    for name, record in found.items():
+        for number, (quantity, _, _) in enumerate(model.errors):
+            printed = published[name][number] if name in published else None
+            out.append(Row(name, quantity, printed, *armse(record.squared[number]), decimals=2))
+    return out
+
+
+def weight_row(found: Mapping[str, Record], quantity: str, published: Mapping[str, float], steps: slice) -> list[Row]:
+    """The mean weight of sensor 1 over some steps, of the filters that choose one."""
+    return [
+        Row(name, quantity, published.get(name), *mean(record.weight[steps].mean(axis=0)), decimals=3)
+        for name, record in found.items()
+        if np.ptp(record.weight) > 0
+    ]
+
+
+LABELS = {"noncoop": "sensor 1 alone", "ic": "IC", "nf": "NF", "aa": "AA", "ci": "CI", "cu": "CU"}
+SHADES = {"noncoop": "#888888", "ic": "#000000", "nf": colour("naive")}
+
+
+def draw(figure: Any, model: Model, found: Mapping[str, Record], kind: str) -> None:
+    """RMSE over time, a row an error, a column a kind of filter; then the weight of sensor 1 under AA."""
+    axes = figure.subplots(len(model.errors) + 1, 2, sharex=True)
+    time = np.arange(1, model.steps + 1)
+    for column, one in enumerate((kind, "sir")):
+        for number, (quantity, _, _) in enumerate(model.errors):
+            ax = axes[number, column]
+            for name, label in LABELS.items():
+                rmse = np.sqrt(found[f"{one}-{name}"].squared[number].mean(axis=1))
+                ax.plot(time, rmse, color=SHADES.get(name) or colour(name), label=label, lw=1.3)
+            ax.set_yscale("log")
+            ax.sharey(axes[number, 0])
+            ax.set_ylabel(f"RMSE, {quantity}")
+            ax.grid(alpha=0.3, which="both", lw=0.5)
+        axes[0, column].set_title(f"{one.upper()}: RMSE of {found[f'{one}-aa'].weight.shape[1]:,} runs")
+        ax = axes[-1, column]
+        weight = found[f"{one}-aa"].weight
+        middle, sd = weight.mean(axis=1), weight.std(axis=1)
+        ax.fill_between(time, middle - sd, middle + sd, color=colour("aa"), alpha=0.25, lw=0, label="± std. dev.")
+        ax.plot(time, middle, color=colour("aa"), label="mean")
+        ax.set_ylabel(f"weight of sensor 1 in {one.upper()}-AA")
+        ax.set_xlabel("step k (s)")
+        ax.sharey(axes[-1, 0])
+        ax.grid(alpha=0.3, lw=0.5)
+        ax.legend(frameon=False, ncols=2)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False)
