@@ -82,7 +82,7 @@ def _record(log: Log) -> Record:
     return Record(np.stack(squared, axis=1), np.array(weight))
 
 
-def join(parts: Sequence[Scene] | Sequence[Record]) -> tuple[Floats, Floats]:
+def join(parts: Sequence[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
     """The runs of all, side by side."""
     first, second = zip(*parts, strict=True)
     return np.concatenate(first, axis=-1), np.concatenate(second, axis=-1)

@@ -35,57 +35,59 @@ def _diversity(means: Floats, covariances: Floats) -> Floats:
     return fuse_last("aa", means, covariances, criterion="diversity").weights
 
 
-def _weighted(rule: str, weights: float | Weigh, **options: Any) -> Fuse:
-    """The rule with weights that it would not choose itself: that of sensor 1, or a function."""
+def _weights(weights: float | Weigh, means: Floats, covariances: Floats) -> Floats:
+    """(2, B): that of sensor 1 given, or a function."""
+    if callable(weights):
+        return weights(means, covariances)
+    return np.repeat([[weights], [1.0 - weights]], means.shape[-1], axis=1)
+
+
+def _ci(weights: float | Weigh) -> Fuse:
+    """CI with weights that it would not choose itself."""
+    return lambda means, covariances: fuse_last("ci", means, covariances, _weights(weights, means, covariances))
+
+
+def _largest(weights: float | Weigh = 0.5) -> Fuse:
+    """CU as (8) and its footnote have it: that one of the P_i + (x - x_i)(x - x_i)' whose trace is the larger."""
 
     def fuse(means: Floats, covariances: Floats) -> Fused:
-        if callable(weights):
-            return fuse_last(rule, means, covariances, weights(means, covariances), **options)
-        fixed = np.repeat([[weights], [1.0 - weights]], means.shape[-1], axis=1)
-        return fuse_last(rule, means, covariances, fixed, **options)
+        w = _weights(weights, means, covariances)
+        x = w[0] * means[0] + w[1] * means[1]
+        d = means - x
+        U = covariances + d[:, :, None] * d[:, None]
+        return Fused(x, np.where(linalg.trace(U[0]) >= linalg.trace(U[1]), U[0], U[1]), w, None)
 
     return fuse
 
 
-def _largest(means: Floats, covariances: Floats) -> Fused:
-    """CU as (8) has it: that one of the P_i + (x - x_i)(x - x_i)' whose trace is largest, weights 1/2."""
-    x = 0.5 * (means[0] + means[1])
-    d = means - x
-    U = covariances + d[:, :, None] * d[:, None]
-    first = linalg.trace(U[0]) >= linalg.trace(U[1])
-    return Fused(x, np.where(first, U[0], U[1]), np.full(means[:, 0].shape, 0.5), None)
-
-
 DIVERSITY = fuser("aa:criterion=diversity")
-FUSION: Mapping[str, Fuse | None] = {
-    "noncoop": alone,
-    "ic": None,
+FUSED: Mapping[str, Fuse] = {
     "nf": fuser("naive"),
     "aa": DIVERSITY,
     "ci": fuser("ci:criterion=trace"),
-    "cu": fuser("cu:criterion=trace"),
+    "cu": _largest(),
 }
+FUSION: Mapping[str, Fuse | None] = {"noncoop": alone, "ic": None, **FUSED}
 INVERSE_TRACE: Weigh = partial(_shares, linalg.trace)
 INVERSE_DET: Weigh = partial(_shares, linalg.det)
 OTHERS: Mapping[str, Fuse] = {
     "aa bound (45)": fuser("aa:criterion=bound"),
     "aa uniform": fuser("aa"),
     "ci det": fuser("ci:criterion=det"),
-    "ci 1/det": _weighted("ci", INVERSE_DET),
-    "ci 1/trace": _weighted("ci", INVERSE_TRACE),
-    "ci w1 = 1/2": _weighted("ci", 0.5),
-    "cu det": fuser("cu:criterion=det"),
-    "cu largest trace (8)": _largest,
+    "ci 1/det": _ci(INVERSE_DET),
+    "ci 1/trace": _ci(INVERSE_TRACE),
+    "ci w1 = 1/2": _ci(0.5),
+    "cu least trace (7)": fuser("cu:criterion=trace"),
+    "cu least det (7)": fuser("cu:criterion=det"),
     "cu min (9)": fuser("cu:criterion=trace,bound=min"),
-    "cu weights (40)": _weighted("cu", _diversity, criterion="trace"),
-    "cu w1 = 1/4": _weighted("cu", 0.25, criterion="trace"),
-    "cu w1 = 1": _weighted("cu", 1.0, criterion="trace"),
+    "cu weights (40)": _largest(_diversity),
+    "cu w1 = 1/4": _largest(0.25),
+    "cu w1 = 1": _largest(1.0),
 }
-FUSED = ("nf", "aa", "ci", "cu")
 CLOUDS: Mapping[str, Callable[..., Record]] = {
     "noncoop": partial(sir, joint=False),
     "ic": partial(sir, joint=True),
-    **{name: partial(sir_fused, rule=FUSION[name], union=name == "aa") for name in FUSED},
+    **{name: partial(sir_fused, rule=rule, union=name == "aa") for name, rule in FUSED.items()},
     "noncoop multinomial": partial(sir, joint=False, systematic=False),
     "aa from a Gaussian": partial(sir_fused, rule=DIVERSITY),
     "ci 1/det": partial(sir_fused, rule=OTHERS["ci 1/det"]),
@@ -106,7 +108,7 @@ def records(run: Run, model: Model, kind: str, exact: bool) -> dict[str, Record]
         start = "truth from P0" if exact else "truth at mu0"
         parts = (
             ("", gaussian(model, scene, {**FUSION, **OTHERS, **extra})),
-            (" without feedback", gaussian(model, scene, {name: FUSION[name] for name in FUSED}, feedback=False)),
+            (" without feedback", gaussian(model, scene, FUSED, feedback=False)),
             (f" {start}", gaussian(model, other, FUSION)),
         )
         for suffix, part in parts:

@@ -28,9 +28,9 @@ from studies import li_tables
 from studies.feedback import Model
 from studies.study import Floats, Result, Run, Study
 
-F = np.kron(np.eye(2), [[1.0, 1.0], [0.0, 1.0]])
-NOISE = np.kron(np.eye(2), [[0.5], [1.0]])
+F = np.array(np.kron(np.eye(2), [[1.0, 1.0], [0.0, 1.0]]), dtype=np.float64)
 ACCELERATION = 5.0
+Q = np.array(ACCELERATION**2 * np.kron(np.eye(2), [[0.25, 0.5], [0.5, 1.0]]), dtype=np.float64)
 H = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0]])
 SIGMA = np.array([[20.0, 20.0], [40.0, 40.0]])
 
@@ -60,7 +60,7 @@ def observe(sensor: int, x: Floats) -> Floats:
 
 
 def predict(state: Estimate) -> Estimate:
-    return kalman.predict(state, F, ACCELERATION**2 * NOISE @ NOISE.T)
+    return kalman.predict(state, F, Q)
 
 
 def update(state: Estimate, sensor: int, z: Floats) -> Estimate:

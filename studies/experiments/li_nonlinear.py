@@ -1,5 +1,5 @@
-"""A target that turns (state: position, velocity, turn rate), seen for 100 steps of 1 s by two sensors that measure range
-and bearing, with errors of 10 m and 1 deg from (0, 0) and of 20 m and 2 deg from (500, 0). Each has a filter, a
+"""A target that turns (state: position, velocity, turn rate), seen for 100 steps of 1 s by two sensors that measure
+range and bearing, with errors of 10 m and 1 deg from (0, 0) and of 20 m and 2 deg from (500, 0). Each has a filter, a
 cubature Kalman filter (CKF) or a particle filter (SIR, 500 particles); as in `li-linear` both go on from the fused
 result after every step. **The truth starts at mu0 exactly**, while the filters' prior is N(mu0, P0): so the printed
 table comes out; with the truth drawn from the prior ("truth from P0") all errors are larger.
