@@ -143,11 +143,11 @@ def rows(model: Model, found: Mapping[str, Record], published: Mapping[str, tupl
 
 
 def weight_row(found: Mapping[str, Record], quantity: str, published: Mapping[str, float], steps: slice) -> list[Row]:
-    """The mean weight of sensor 1 over some steps, of the filters that choose one."""
+    """The mean weight of sensor 1 over some steps, of the filters whose weight the data decide."""
     return [
         Row(name, quantity, published.get(name), *mean(record.weight[steps].mean(axis=0)), decimals=3)
         for name, record in found.items()
-        if np.ptp(record.weight) > 0
+        if record.weight.std(axis=1).max() > 1e-9
     ]
 
 
