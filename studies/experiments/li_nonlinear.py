@@ -47,14 +47,16 @@ PUBLISHED = {
 }
 
 
-def turn(x: Floats) -> Floats:
+def turn(state: Floats) -> Floats:
     """F(omega) x, for states (5, ..., B)."""
-    px, vx, py, vy, omega = x
-    rate = np.where(np.abs(omega) < 1e-9, 1e-9, omega)
-    sin, cos = np.sin(rate), np.cos(rate)
-    along, across = sin / rate, (1 - cos) / rate
+    px, vx, py, vy, omega = state
+    half = 0.5 * omega
+    sin, cos = np.sin(half), np.cos(half)
+    ratio = np.divide(sin, half, out=np.ones_like(half), where=half != 0.0)
+    along, across = ratio * cos, ratio * sin  # sin(omega) / omega, (1 - cos(omega)) / omega
+    c, s = 1.0 - 2.0 * sin * sin, 2.0 * sin * cos
     return np.stack(
-        [px + along * vx - across * vy, cos * vx - sin * vy, py + across * vx + along * vy, sin * vx + cos * vy, omega]
+        [px + along * vx - across * vy, c * vx - s * vy, py + across * vx + along * vy, s * vx + c * vy, omega]
     )
 
 
@@ -124,8 +126,8 @@ STUDIES = (
         source="Li-AA IV-B, Table II, Figs. 7-11",
         about=__doc__ or "",
         run=run,
-        runs=1_000,
-        quick=10,
+        runs=500,
+        quick=4,
         seconds=200.0,
         published_runs=100,
         takes_rules=True,

@@ -161,18 +161,29 @@ def test_bearings_wrap() -> None:
 
 
 def test_the_ckf_is_that_of_stone_soup() -> None:
+    """Of two ranges: bearings Stone Soup averages on the circle, which differs in the third order of their spread."""
     pytest.importorskip("stonesoup")
-    from stonesoup.models.measurement.nonlinear import CartesianToBearingRange
+    from stonesoup.models.measurement.nonlinear import NonLinearGaussianMeasurement
     from stonesoup.models.transition.linear import CombinedLinearGaussianTransitionModel, ConstantVelocity
     from stonesoup.predictor.kalman import CubatureKalmanPredictor
+    from stonesoup.types.array import StateVector
     from stonesoup.types.detection import Detection
     from stonesoup.types.hypothesis import SingleHypothesis
     from stonesoup.types.state import GaussianState
     from stonesoup.updater.kalman import CubatureKalmanUpdater
 
-    q, R = 0.3, np.diag([0.02**2, 5.0**2])
+    def ranges(x: Floats) -> Floats:
+        return np.stack([np.hypot(x[0], x[2]), np.hypot(x[0] - 100.0, x[2])])
+
+    class Ranges(NonLinearGaussianMeasurement):
+        ndim_meas = 2
+
+        def function(self, state, noise=False, **kwargs):
+            return StateVector(ranges(np.asarray(state.state_vector, float)[:, 0]))
+
+    q, R = 0.3, np.diag([5.0**2, 8.0**2])
     motion = CombinedLinearGaussianTransitionModel([ConstantVelocity(q), ConstantVelocity(q)])
-    sensor = CartesianToBearingRange(ndim_state=4, mapping=(0, 2), noise_covar=R)
+    sensor = Ranges(ndim_state=4, mapping=(0, 2), noise_covar=R)
     mean, P = np.array([200.0, 3, 150, -2]), np.diag([400.0, 4, 300, 9])
     F = np.kron(np.eye(2), [[1.0, 1], [0, 1]])
     Q = q * np.kron(np.eye(2), [[1 / 3, 1 / 2], [1 / 2, 1]])
@@ -181,11 +192,11 @@ def test_the_ckf_is_that_of_stone_soup() -> None:
     rule = sigma_points.cubature(4)
     rng = np.random.default_rng(8)
     for k in range(1, 6):
-        z = np.array([[np.arctan2(150, 200) + 0.02 * rng.standard_normal()], [250 + 5 * rng.standard_normal()]])
+        z = ranges(mean[:, None]) + np.sqrt(np.diag(R))[:, None] * rng.standard_normal((2, 1))
         predicted = CubatureKalmanPredictor(motion).predict(theirs, timestamp=begin + timedelta(seconds=k))
         seen = Detection(z, timestamp=begin + timedelta(seconds=k), measurement_model=sensor)
         theirs = CubatureKalmanUpdater(sensor).update(SingleHypothesis(predicted, seen))
         ours = sigma_points.predict(rule, lambda x: np.einsum("ij,jsb->isb", F, x), ours, Q)
-        ours = sigma_points.update(rule, lambda x: np.stack([np.arctan2(x[2], x[0]), np.hypot(x[0], x[2])]), ours, R, z)
+        ours = sigma_points.update(rule, ranges, ours, R, z)
         np.testing.assert_allclose(ours.mean[:, 0], np.asarray(theirs.state_vector, float)[:, 0], rtol=1e-9)
         np.testing.assert_allclose(ours.covariance[..., 0], np.asarray(theirs.covar, float), rtol=1e-7, atol=1e-9)
