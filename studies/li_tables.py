@@ -92,6 +92,7 @@ CLOUDS: Mapping[str, Callable[..., Record]] = {
     "aa from a Gaussian": partial(sir_fused, rule=DIVERSITY),
     "ci 1/det": partial(sir_fused, rule=OTHERS["ci 1/det"]),
     "cu w1 = 1/4": partial(sir_fused, rule=OTHERS["cu w1 = 1/4"]),
+    "ic multinomial": partial(sir, joint=True, systematic=False),
 }
 
 
@@ -152,32 +153,46 @@ def weight_row(found: Mapping[str, Record], quantity: str, published: Mapping[st
 
 
 LABELS = {"noncoop": "sensor 1 alone", "ic": "IC", "nf": "NF", "aa": "AA", "ci": "CI", "cu": "CU"}
-SHADES = {"noncoop": "#888888", "ic": "#000000", "nf": colour("naive")}
+STYLES: Mapping[str, dict[str, Any]] = {
+    "noncoop": {"color": "#555555", "ls": "--", "zorder": 3},
+    "ic": {"color": "#000000"},
+    "nf": {"color": colour("naive")},
+}
 
 
 def draw(figure: Any, model: Model, found: Mapping[str, Record], kind: str) -> None:
     """RMSE over time, a row an error, a column a kind of filter; then the weight of sensor 1 under AA."""
-    axes = figure.subplots(len(model.errors) + 1, 2, sharex=True)
+    from matplotlib.ticker import LogLocator
+
+    axes = figure.subplots(len(model.errors) + 1, 2, sharex=True, sharey="row")
     time = np.arange(1, model.steps + 1)
     for column, one in enumerate((kind, "sir")):
-        for number, (quantity, _, _) in enumerate(model.errors):
-            ax = axes[number, column]
+        axes[0, column].set_title(f"{one.upper()} filters with feedback, RMSE over {_count(found):,} runs")
+        for ax, (number, (quantity, _, _)) in zip(axes[:, column], enumerate(model.errors), strict=False):
             for name, label in LABELS.items():
                 rmse = np.sqrt(found[f"{one}-{name}"].squared[number].mean(axis=1))
-                ax.plot(time, rmse, color=SHADES.get(name) or colour(name), label=label, lw=1.3)
-            ax.set_yscale("log")
-            ax.sharey(axes[number, 0])
-            ax.set_ylabel(f"RMSE, {quantity}")
-            ax.grid(alpha=0.3, which="both", lw=0.5)
-        axes[0, column].set_title(f"{one.upper()}: RMSE of {found[f'{one}-aa'].weight.shape[1]:,} runs")
-        ax = axes[-1, column]
+                ax.plot(time, rmse, label=label, lw=1.3, **STYLES.get(name, {"color": colour(name)}))
+            ax.set_ylabel(quantity)
         weight = found[f"{one}-aa"].weight
         middle, sd = weight.mean(axis=1), weight.std(axis=1)
-        ax.fill_between(time, middle - sd, middle + sd, color=colour("aa"), alpha=0.25, lw=0, label="± std. dev.")
-        ax.plot(time, middle, color=colour("aa"), label="mean")
-        ax.set_ylabel(f"weight of sensor 1 in {one.upper()}-AA")
+        ax = axes[-1, column]
+        ax.fill_between(time, middle - sd, middle + sd, color=colour("aa"), alpha=0.25, lw=0)
+        ax.plot(time, middle, color=colour("aa"))
+        ax.set_ylabel("AA: weight of sensor 1,\nmean and ± std. dev. over the runs")
         ax.set_xlabel("step k (s)")
-        ax.sharey(axes[-1, 0])
-        ax.grid(alpha=0.3, lw=0.5)
-        ax.legend(frameon=False, ncols=2)
+    for ax in axes[:-1].flat:
+        ax.set_yscale("log")
+        ax.yaxis.set_major_formatter("{x:g}")
+        low, high = ax.get_ylim()
+        if high < 6 * low:
+            ax.yaxis.set_minor_formatter("{x:g}")
+        else:
+            ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    for ax in axes.flat:
+        ax.grid(alpha=0.3, which="both", lw=0.5)
+        ax.tick_params(labelleft=True)
     figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside upper center", ncols=6, frameon=False)
+
+
+def _count(found: Mapping[str, Record]) -> int:
+    return next(iter(found.values())).weight.shape[1]
