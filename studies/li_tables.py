@@ -148,7 +148,7 @@ def weight_row(found: Mapping[str, Record], quantity: str, published: Mapping[st
     return [
         Row(name, quantity, published.get(name), *mean(record.weight[steps].mean(axis=0)), decimals=3)
         for name, record in found.items()
-        if record.weight.std(axis=1).max() > 1e-9
+        if record.weight[steps].std(axis=1).max() > 1e-9
     ]
 
 
@@ -188,6 +188,7 @@ def draw(figure: Any, model: Model, found: Mapping[str, Record], kind: str) -> N
             ax.yaxis.set_minor_formatter("{x:g}")
         else:
             ax.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            ax.yaxis.set_minor_formatter("")
     for ax in axes.flat:
         ax.grid(alpha=0.3, which="both", lw=0.5)
         ax.tick_params(labelleft=True)
@@ -195,4 +196,4 @@ def draw(figure: Any, model: Model, found: Mapping[str, Record], kind: str) -> N
 
 
 def _count(found: Mapping[str, Record]) -> int:
-    return next(iter(found.values())).weight.shape[1]
+    return int(next(iter(found.values())).weight.shape[1])
