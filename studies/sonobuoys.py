@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.rules import Fused
 from sensor_clients.filters import kalman, shifted_rayleigh, sigma_points
 from sensor_clients.filters.kalman import Estimate
 from sensor_clients.filters.sigma_points import Rule
-from studies.rules import Fuser
 from studies.study import Floats
 
 __all__ = [
@@ -28,9 +28,12 @@ __all__ = [
     "CV",
     "FILTERS",
     "KNOT",
+    "Q1",
     "STEPS",
+    "TRACKERS",
     "Readings",
     "Scenario",
+    "T",
     "Tracks",
     "centres",
     "field",
@@ -148,11 +151,11 @@ def move(x: Floats) -> Floats:
     return out
 
 
-def truth(scenario: Scenario, rng: np.random.Generator, runs: int, readings: Readings) -> Floats:
+def truth(scenario: Scenario, rng: np.random.Generator, runs: int, readings: Readings, steps: int = STEPS) -> Floats:
     """True states (K+1, n, M)."""
     x = np.repeat(scenario.state()[:, None], runs, axis=1)
     path = [x]
-    for _ in range(STEPS):
+    for _ in range(steps):
         Q = noise(scenario, x[4] if scenario.n == 5 else np.zeros(runs), readings.q2)
         root = np.linalg.cholesky(np.moveaxis(Q, -1, 0))
         w = np.einsum("mij,jm->im", root, rng.standard_normal((scenario.n, runs)))
@@ -257,27 +260,28 @@ def fly(
     sensors: Floats,
     count: int = 2,
     name: str = "SRF",
-    consensus: Fuser | None = None,
+    consensus: Callable[[Floats, Floats], Fused] | None = None,
     readings: Readings = Readings(),
+    steps: int = STEPS,
 ) -> tuple[Floats, Tracks]:
     """Truth (K+1, n, M) and tracks of M runs with sensors (2, 25, N, M), `count` of them selected by each tracker every
     2 min about its own estimate (the first time about the true place), by the filter `name`. consensus: the four
     posteriors are fused so, and all trackers go on from the result. The same `rng`: same truth, and errors of the
     sensors the same for any filter and rule."""
     M, n, most = sensors.shape[-1], scenario.n, 4
-    true = truth(scenario, rng, M, readings)
+    true = truth(scenario, rng, M, readings, steps)
     field = sensors.reshape(2, SENSORS, TRACKERS * M)
-    errors = SIGMA * rng.standard_normal((STEPS + 1, most, TRACKERS * M))
+    errors = SIGMA * rng.standard_normal((steps + 1, most, TRACKERS * M))
     drawn = rng.standard_normal((3, TRACKERS * M))
     tiled = np.tile(true, (1, 1, TRACKERS))
     every = np.arange(TRACKERS * M)
     active = field[:, select(tiled[0, :2], field, count, readings.inverse), every]
     state = _begin(readings, tiled[:2], active[:, :2], errors[:2, :2], drawn)
     predict, update = _steps(scenario, name, readings.q2)
-    means = np.empty((STEPS + 1, TRACKERS, n, M))
-    covariances = np.empty((STEPS + 1, TRACKERS, n, n, M))
-    weights = None if consensus is None else np.empty((STEPS + 1, TRACKERS, M))
-    for k in range(STEPS + 1):
+    means = np.empty((steps + 1, TRACKERS, n, M))
+    covariances = np.empty((steps + 1, TRACKERS, n, n, M))
+    weights = None if consensus is None else np.empty((steps + 1, TRACKERS, M))
+    for k in range(steps + 1):
         if k:
             state = predict(state)
             if k % RESELECT == 0:
