@@ -29,7 +29,7 @@ from sensor_clients.filters.measurement import Floats
 
 __all__ = ["shifted_rayleigh", "update"]
 
-FAR = -20.0
+FAR = -40.0
 """Below this shift the mean and variance come from their series in 1 / z."""
 
 
