@@ -290,19 +290,19 @@ def notes(scenario: Scenario, rows: Sequence[Row], run: Run) -> tuple[str, ...]:
         f"({anees[0]}) or by (23) ({anees[1]}), where it is too wide; by det ({anees[2]}) it is inside while one "
         f"tracker has nearly all the weight. AMD ({anees[3]}) is far too wide, as the paper says; so is GMD at equal "
         f"weights ({anees[4]}).",
-        f"Divergence: 0 of {run.runs} runs excludes more than {300 / run.runs:.2g} %. Far tracks begin beyond 1 km in "
-        "some runs, since two bearings from 5 to 10 km away place a target no better. The printed percentages grow with "
-        "the distance at the end, so they are taken to be counted there; neither (31) as printed nor the Fisher "
+        f"Divergence: 0 of {run.runs} runs excludes more than {300 / run.runs:.2g} %. Far tracks begin beyond 1 km "
+        "in some runs, since two bearings from 5 to 10 km away place a target no better. The printed percentages grow "
+        "with the distance at the end, so they are taken to be counted there; neither (31) as printed nor the Fisher "
         "information as printed gives them (last rows).",
     ]
     if scenario.number == 1:
         text.append("Table III, n = 3, Track-3: 55.13 exceeds the 47.19 of n = 2: a misprint, probably.")
     if run.runs >= FEW:
         text += [
-            "Fed back, HMD by det is too sure of itself: what four posteriors of one prior share is counted more "
-            "than once. (23) is not run fed back: it would be 145 searches one after another.",
-            "That all filters do the same comes out. GHF: a fifth of the runs; readings: half of them, and without lost "
-            "runs, whose share is given where there are any.",
+            "Fed back, HMD by det is too sure of itself: what four posteriors of one prior share is counted "
+            "more than once. (23) is not run fed back: it would be 145 searches one after another.",
+            "That all filters do the same comes out. GHF: a fifth of the runs; readings: half of them, and without "
+            "lost runs, whose share is given where there are any.",
         ]
     return tuple(text)
 
