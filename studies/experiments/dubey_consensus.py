@@ -104,14 +104,14 @@ def node(number: int, endpoint: str, missions: Missions, pipe: Any) -> None:
     try:
         config = centre_config({**SETTINGS, "name": f"node-{number + 1}"})
         whole = ServiceConfig(config, BusConfig(connect=(endpoint,)), DaemonConfig(status_period=0.2))
-        service = threading.Thread(target=run_service, args=(whole, stop), daemon=True)
+        service = threading.Thread(target=run_service, args=(whole, stop))
         service.start()
         try:
             pipe.send(_track(number, endpoint, missions, config.name, stop))
             stop.wait()
         finally:
             stop.set()
-            service.join(5.0)
+            service.join()
     except Exception:
         with suppress(OSError):
             pipe.send(traceback.format_exc())
@@ -212,7 +212,7 @@ def _wait(pictures: Queue[GlobalTracks], at: int) -> GlobalTracks:
 
 class Crew:
     """Processes, each at the end of a pipe. Leaving the context closes the pipes, on which they end, and kills what is
-    left after 10 s."""
+    left after 20 s."""
 
     def __init__(self) -> None:
         self._context = multiprocessing.get_context("spawn")
@@ -232,7 +232,7 @@ class Crew:
     def __exit__(self, *_: object) -> None:
         for _, pipe in self._crew:
             pipe.close()
-        deadline = time.monotonic() + 10.0
+        deadline = time.monotonic() + 20.0
         for process, _ in self._crew:
             process.join(max(0.1, deadline - time.monotonic()))
             if process.is_alive():
@@ -326,6 +326,6 @@ STUDIES = (
         run=run,
         runs=5,
         quick=1,
-        seconds=60.0,
+        seconds=110.0,
     ),
 )
