@@ -383,12 +383,12 @@ STUDIES = tuple(
         run=partial(run, scenario),
         runs=1000,
         quick=6,
-        seconds=300.0,
+        seconds=seconds,
         published_runs=50,
         takes_rules=True,
     )
-    for what, words, section, scenario in (
-        ("cv", "constant velocity", "B", CV),
-        ("ct", "constant turn rate", "C", CT),
+    for what, words, section, scenario, seconds in (
+        ("cv", "constant velocity", "B", CV, 140.0),
+        ("ct", "constant turn rate", "C", CT, 260.0),
     )
 )
