@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from fusion_service.commands import export
+from fusion_service.commands import export, repair
 
 __all__ = ["COMMANDS"]
 
-COMMANDS: tuple[ModuleType, ...] = (export,)
+COMMANDS: tuple[ModuleType, ...] = (export, repair)
 """In the order of the help; a command is called as its module, with hyphens."""

@@ -7,6 +7,7 @@ Entities, each with its places on the plane and, where the frame allows, on the 
     /picture/global/{centre}             the same, labelled with the id; faint: tentative, dashed: coasting
     .../components                       the Gaussians of the tracks that are mixtures;  .../ellipses
     /picture/local/{source}/intensity    those of an intensity;                          .../ellipses
+    /picture/global/{centre}/links/...   lines from the local tracks of each source to the global ones: `links`
     /picture/truth/{scenario}            true positions;     .../trail
     /grid                                on the plane only
 
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from fusion_service.recording import palette
 from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
 from fusion_service.recording.geometry import CORNERS, Chart, Outline, Place, ellipses, grid, moments, outline
+from fusion_service.recording.links import links
 from fusion_service.recording.tables import COASTING, LEVELS, Table, components, hold, levels, tabulate
 from schemas import Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
@@ -39,22 +41,34 @@ KEPT_PERIODS = 3.0
 """How long, in periods of its source, a track stays drawn that an incomplete message does not list."""
 FAINTEST = 40
 """Opacity of what hardly exists, of 255."""
+MAX_GENERATIONS = 1000
+"""Runs of services that are numbered; those beyond are called by their generation."""
 FEW = 100
 """Components of one message whose ellipses are drawn finely."""
+LINK = 200
+"""Opacity of the lines from local tracks to global ones."""
 WIDTH = 1.5
 """Of the ellipse of a global track, and of a component of weight 1, in points of the screen."""
 
 
 class Drawing:
-    """Turns messages into rows of `columns`. `chart` must be set before anything but `open_chart` is called."""
+    """Turns messages into rows of `columns`. `chart` must be set before anything but `open_chart` is called.
 
-    def __init__(self, columns: Columns, frame: Frame | None = None) -> None:
+    focus: the global track about whose path the view is, None for the whole picture.
+    """
+
+    def __init__(self, columns: Columns, frame: Frame | None = None, focus: int | None = None) -> None:
         self._rr = import_rerun()
         self._columns = columns
         self.chart: Chart | None = None if frame is None else Chart(frame)
         self.trails: list[str] = []
         self.sources: dict[str, str] = {}
         self.colours: dict[str, palette.Colour] = {}
+        self.centres: dict[str, palette.Colour] = {}
+        self.linked: set[tuple[str, str]] = set()
+        self._focus = focus
+        self._sight: tuple[Floats, Floats] | None = None
+        self._path: tuple[Floats, Floats] | None = None
         self.changed = True
         self._generations: dict[int, int] = {}
         self._tables: dict[str, Table] = {}
@@ -79,6 +93,8 @@ class Drawing:
         """A global id by its lower half, a counter; from the second generation (upper half) seen on, after the number
         of its generation: 7, 2.7."""
         generation, counter = divmod(int(track), 1 << 32)
+        if generation not in self._generations and len(self._generations) >= MAX_GENERATIONS:
+            return f"{generation}.{counter}"
         number = self._generations.setdefault(generation, len(self._generations) + 1)
         return f"{number}.{counter}" if number > 1 else str(counter)
 
@@ -139,12 +155,44 @@ class Drawing:
         self._grow(table.place.xy, main=True)
         path = entity("picture", "global", message.source)
         if self._first(path):
-            self._style(path, palette.FUSED, radius=4.5, width=WIDTH, alpha=255, labels=True, weighed=True)
+            self.centres[message.source] = palette.FUSED
+            self._recolour = True
         over = self._components(f"{path}/components", message, sound, stamp)
         table = self._trail(path, table, message.time, 0, stamp)
         self._tracks(path, table, [self.label(track) for track in table.ids.tolist()], stamp)
         self._ellipses(path, table, stamp, weighed=True, dashed=True)
+        self._links(message, table, stamp)
+        if self._focus is not None:
+            self._follow(table, self._focus)
         return over
+
+    def _links(self, message: GlobalTracks, table: Table, stamp: Stamp) -> None:
+        local = {name: self._tables[own] for name, own in self.sources.items() if own in self._tables}
+        for name, ends, z in links(message, table, local):
+            key = message.source, name
+            if not len(ends) and key not in self.linked:
+                continue
+            if key not in self.linked:
+                if name not in self.sources:
+                    continue
+                self.linked.add(key)
+                self._style_links(*key)
+            lengths = np.full(len(ends), 2)
+            content = self._lines(ends.reshape(-1, 2), z.reshape(-1), lengths)
+            self._columns.lines(_links_path(*key), stamp, content)
+
+    def _follow(self, table: Table, track: int) -> None:
+        """Let the view hold the track and half its ellipses around it; it grows in steps."""
+        for row in np.flatnonzero(table.ids == np.uint64(track)).tolist():
+            margin = 3.0 * float(np.sqrt(np.trace(table.place.covariance[row])))
+            low, high = table.place.xy[row] - margin, table.place.xy[row] + margin
+            if self._path is not None:
+                low, high = np.minimum(low, self._path[0]), np.maximum(high, self._path[1])
+            self._path = low, high
+            if self._sight is None or (low < self._sight[0]).any() or (high > self._sight[1]).any():
+                centre, half = (low + high) / 2, 0.65 * max(float((high - low).max()), 10.0)
+                self._sight = centre - half, centre + half
+                self.changed = True
 
     def truth(self, message: Truth, stamp: Stamp) -> None:
         n = len(message.space)
@@ -232,7 +280,8 @@ class Drawing:
             _, before, after = np.intersect1d(old.ids, new.ids, assume_unique=True, return_indices=True)
             ends = np.stack([old.place.xy[before], new.place.xy[after]], axis=1).reshape(-1, 2)
             z = np.stack([old.place.z[before], new.place.z[after]], axis=1).reshape(-1)
-            self._columns.lines(f"{path}/trail", stamp, self._lines(ends, z, np.full(len(before), 2)))
+            pieces = self._lines(ends, z, np.full(len(before), 2))
+            self._columns.lines(f"{path}/trail", stamp, pieces, stands=False)
         return self._hold(path, new, new.ids, time, keep)
 
     def _hold(self, path: str, new: Table, listed: U64, time: int, keep: int) -> Table:
@@ -265,6 +314,11 @@ class Drawing:
         if not self._recolour:
             return
         self._recolour = False
+        for name, colour in palette.centre_colours(self.centres).items():
+            path = entity("picture", "global", name)
+            if self._tones.get(path) != colour:
+                self.centres[name] = colour
+                self._style(path, colour, radius=4.5, width=WIDTH, alpha=255, labels=True, weighed=True)
         for name, colour in palette.source_colours(self.sources).items():
             if self.colours.get(name) == colour:
                 continue
@@ -274,6 +328,16 @@ class Drawing:
             self._columns.static(path, *_both(self._rr, "Points", colors=[palette.packed(colour)], radii=[-6.0]))
             edge = _both(self._rr, "Lines", colors=[palette.packed(colour, 110)], radii=[-0.75])
             self._columns.static(f"{path}/coverage", *edge)
+            for centre, source in self.linked:
+                if source == name:
+                    self._style_links(centre, source)
+
+    def _style_links(self, centre: str, source: str) -> None:
+        """Thin, under the tracks."""
+        tone = palette.packed(self.colours.get(source, palette.NEUTRAL), LINK)
+        path = _links_path(centre, source)
+        self._columns.static(path, *_both(self._rr, "Lines", colors=[tone], radii=[-0.5]))
+        self._columns.static(path, self._rr.LineStrips2D.from_fields(draw_order=10.0))
 
     def _style(
         self,
@@ -339,8 +403,13 @@ class Drawing:
 
     @property
     def bounds(self) -> tuple[Floats, Floats] | None:
-        """South-west and north-east corner (2,) of the square that the grid covers, m."""
-        return self._grid
+        """South-west and north-east corner (2,) of the square that is seen at first, m: all that the grid covers, or
+        the path of the `focus`."""
+        return self._sight or self._grid
+
+
+def _links_path(centre: str, source: str) -> str:
+    return entity("picture", "global", centre, "links", source)
 
 
 def _both(rr: Any, kind: str, **fields: Any) -> tuple[Any, ...]:
