@@ -31,10 +31,17 @@ BACKGROUND = (16, 16, 18)
 
 
 def blueprint(
-    frame: Frame | None, bounds: Corners | None, *, trails: Sequence[str], trail: float, centres: Sequence[str] = ()
+    frame: Frame | None,
+    bounds: Corners | None,
+    *,
+    trails: Sequence[str],
+    trail: float,
+    centres: Sequence[str] = (),
+    crowded: bool = False,
 ) -> Any:
     """The blueprint for a picture in `frame` within `bounds` (south-west, north-east; m), of whose `trails`
-    (entities) the last `trail` seconds are seen. centres: whose global tracks it shows."""
+    (entities) the last `trail` seconds are seen. centres: whose global tracks it shows. crowded: there are too many
+    targets or tracks for a legend; a series under the pointer says its name."""
     rr = import_rerun()
     import rerun.blueprint as rrb
 
@@ -43,8 +50,11 @@ def blueprint(
 
     def charts(kind: str, name: str, top: float | None = None) -> Any:
         if not several:
-            return _chart(rr, rrb, f"/{kind}", name, top)
-        views = [_chart(rr, rrb, entity(kind, one), f"{name}: {one}", top) for one in several]
+            return _chart(rr, rrb, f"/{kind}", name, top, legend=kind == "influence" or not crowded)
+        views = [
+            _chart(rr, rrb, entity(kind, one), f"{name}: {one}", top, legend=kind == "influence" or not crowded)
+            for one in several
+        ]
         return rrb.Vertical(*views, name=name)
 
     upper = [
@@ -71,12 +81,13 @@ def track_blueprint(
     bounds: Corners | None,
     track: str,
     *,
+    reach: float,
     trails: Sequence[str],
     trail: float,
     centres: Sequence[str] = (),
 ) -> Any:
-    """The blueprint for one global track, labelled `track`: the picture within `bounds`, about its path, and the series
-    and decisions that a `Recorder` with this `focus` writes."""
+    """The blueprint for one global track, labelled `track`: the picture within `bounds`, about its path; one that goes
+    along with it, `reach` m to each side; the series and decisions that a `Recorder` with this `focus` writes."""
     rr = import_rerun()
     import rerun.blueprint as rrb
 
@@ -93,7 +104,14 @@ def track_blueprint(
         chart(("existence",), f"Track {track}: existence", 1.05),
     ]
     told = [_log(rrb, "/log/track", f"Track {track}: log"), _log(rrb, "/log", "Status log")]
-    return _whole(rrb, rrb.Tabs(*pictures, active_tab=0), [*series, rrb.Tabs(*told, active_tab=0)])
+    along = rrb.Spatial2DView(
+        origin="/near",
+        name=f"Seen from track {track}, its sources and the truth (95 % ellipses)",
+        visual_bounds=rrb.VisualBounds2D(x_range=(-reach, reach), y_range=(-reach, reach)),
+        background=BACKGROUND,
+    )
+    left = rrb.Vertical(rrb.Tabs(*pictures, active_tab=0), along)
+    return _whole(rrb, left, [*series, rrb.Tabs(*told, active_tab=0)])
 
 
 def _whole(rrb: Any, left: Any, right: Sequence[Any]) -> Any:
@@ -144,7 +162,14 @@ def _pictures(
 
 
 def _chart(
-    rr: Any, rrb: Any, origin: str, name: str, top: float | None = None, contents: Sequence[str] | None = None
+    rr: Any,
+    rrb: Any,
+    origin: str,
+    name: str,
+    top: float | None = None,
+    contents: Sequence[str] | None = None,
+    *,
+    legend: bool = True,
 ) -> Any:
     """Over the whole mission; `top`: where the axis ends at first."""
     whole = rr.TimeRange(start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.infinite())
@@ -154,7 +179,7 @@ def _chart(
         name=name,
         axis_x=rrb.TimeAxis(view_range=whole),
         axis_y=None if top is None else rrb.ScalarAxis(range=(0.0, top)),
-        plot_legend=rrb.Corner2D.LeftTop,
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         **more,
     )
 

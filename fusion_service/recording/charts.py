@@ -28,6 +28,8 @@ from schemas.messages import TENTATIVE
 
 __all__ = ["Charts"]
 
+LEGIBLE = 6
+"""Series of a chart that has a legend."""
 MAX_RUNNING = 100
 MAX_SERIES = 1000
 """Series of existence of one centre: at a time (each takes Rerun memory as long as it runs), and in all; of targets
@@ -44,6 +46,11 @@ class Charts:
         self._styles: dict[str, tuple[palette.Colour, str, float]] = {}
         self._targets: set[int] = set()
         self._series: dict[str, set[int]] = {}
+
+    @property
+    def crowded(self) -> bool:
+        """Whether a legend would hide more than it tells."""
+        return max(len(self._targets), *(len(known) for known in self._series.values()), 0) > LEGIBLE
 
     def restart(self) -> None:
         """A new part of the recording begins: every series says its style again."""
@@ -114,7 +121,9 @@ class Charts:
             self._add(entity("track", centre, "existence"), stamp, float(message.existence[row]), own, "existence", 2.0)
             index = [message.space.index(name) for name in "xyz" if name in message.space]
             spread = moments(message)[1][row][np.ix_(index, index)]
-            self._add(entity("track", centre, "sigma"), stamp, float(np.sqrt(np.trace(spread))), own, "sigma", 2.0)
+            self._add(
+                entity("track", centre, "sigma"), stamp, float(np.sqrt(np.trace(spread))), palette.NEUTRAL, "sigma"
+            )
             first = int(message.contributor_counts[:row].sum())
             contributions = slice(first, first + int(message.contributor_counts[row]))
             which = message.contributor_source[contributions].tolist()

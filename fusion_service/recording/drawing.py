@@ -28,6 +28,7 @@ from fusion_service.recording import palette
 from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
 from fusion_service.recording.geometry import CORNERS, Chart, Outline, Place, ellipses, grid, moments, outline
 from fusion_service.recording.links import links
+from fusion_service.recording.near import near
 from fusion_service.recording.tables import COASTING, LEVELS, Table, components, hold, levels, tabulate
 from schemas import Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
@@ -67,6 +68,9 @@ class Drawing:
         self.centres: dict[str, palette.Colour] = {}
         self.linked: set[tuple[str, str]] = set()
         self._focus = focus
+        self.reach = 1.0
+        """Half the width, m, of the view that goes along with the `focus`."""
+        self._scenarios: dict[str, str] = {}
         self._sight: tuple[Floats, Floats] | None = None
         self._path: tuple[Floats, Floats] | None = None
         self.changed = True
@@ -164,6 +168,7 @@ class Drawing:
         self._links(message, table, stamp)
         if self._focus is not None:
             self._follow(table, self._focus)
+            self._near(message, table, self._focus, stamp)
         return over
 
     def _links(self, message: GlobalTracks, table: Table, stamp: Stamp) -> None:
@@ -194,12 +199,33 @@ class Drawing:
                 self._sight = centre - half, centre + half
                 self.changed = True
 
+    def _near(self, message: GlobalTracks, table: Table, track: int, stamp: Stamp) -> None:
+        local = {name: self._tables[own] for name, own in self.sources.items() if own in self._tables}
+        truth = {name: self._tables[own] for name, own in self._scenarios.items() if own in self._tables}
+        for kind, name, part in near(message, track, table, local, truth):
+            path = entity("near", message.source, *(() if kind == "global" else (kind, name)))
+            colour = self.colours.get(name, palette.NEUTRAL)
+            if kind != "local":
+                colour = self.centres[name] if kind == "global" else palette.TRUTH
+            if self._tones.get(path) != colour:
+                bold = kind == "global"
+                self._style(path, colour, radius=4.0, width=WIDTH, alpha=255, labels=True, weighed=bold)
+            labels = [self.label(track) if kind == "global" else name] * len(part.ids)
+            self._tracks(path, part, labels, stamp)
+            if kind != "truth":
+                self._ellipses(path, part, stamp, weighed=kind == "global", dashed=True)
+            reach = np.abs(part.place.xy).max(initial=0.0)
+            reach += 3.0 * float(np.sqrt(part.place.covariance.trace(axis1=1, axis2=2).max(initial=0.0)))
+            if reach > self.reach:
+                self.reach = 1.2 * float(reach)
+                self.changed = True
+
     def truth(self, message: Truth, stamp: Stamp) -> None:
         n = len(message.space)
         place = self._chart.place(message.means, np.zeros((len(message.ids), n, n)), message.space, message.frame)
         table = tabulate(message.epoch, message.time, message.ids, place)
         self._grow(table.place.xy, main=True)
-        path = entity("picture", "truth", message.source)
+        path = self._scenarios[message.source] = entity("picture", "truth", message.source)
         if self._first(path):
             self._style(path, palette.TRUTH, radius=2.0, width=0.5, alpha=255, labels=False)
         table = self._trail(path, table, message.time, 0, stamp)

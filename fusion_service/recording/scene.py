@@ -59,6 +59,8 @@ class Scene:
     def __init__(self, columns: Columns, frame: Frame | None, cutoff: float | None, focus: int | None = None) -> None:
         self.drawing = Drawing(columns, frame, focus)
         self.journal = Journal(columns, self.drawing, focus)
+        self.crowded = False
+        """Whether charts have so many series that a legend would hide them."""
         self.now: int | None = None
         self._start: int | None = None
         self.undrawn: Counter[str] = Counter()
@@ -129,6 +131,8 @@ class Scene:
                     if over:
                         self._leave_out(score.centre, "too many targets", over, score.stamp)
         self.drawing.colour_sources()
+        if self.crowded != self._charts.crowded:
+            self.crowded = self.drawing.changed = True
 
     def _open_chart(self, patience: float) -> bool:
         """Whether the frame of the drawing, and a mission time, are known; takes the frame if it is time to."""
