@@ -106,7 +106,7 @@ def track_blueprint(
     told = [_log(rrb, "/log/track", f"Track {track}: log"), _log(rrb, "/log", "Status log")]
     along = rrb.Spatial2DView(
         origin="/near",
-        name=f"Seen from track {track}, its sources and the truth (95 % ellipses)",
+        name=f"Seen from track {track}: its sources in their colours, the truth grey",
         visual_bounds=rrb.VisualBounds2D(x_range=(-reach, reach), y_range=(-reach, reach)),
         background=BACKGROUND,
     )

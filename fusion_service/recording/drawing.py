@@ -19,6 +19,8 @@ classes, only widths.
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,9 +28,20 @@ from numpy.typing import NDArray
 
 from fusion_service.recording import palette
 from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
-from fusion_service.recording.geometry import CORNERS, Chart, Outline, Place, ellipses, grid, moments, outline
+from fusion_service.recording.geometry import (
+    CORNERS,
+    RING,
+    Chart,
+    Outline,
+    Place,
+    ellipses,
+    grid,
+    moments,
+    outline,
+    rings,
+)
 from fusion_service.recording.links import links
-from fusion_service.recording.near import near
+from fusion_service.recording.near import extent, near, predicted
 from fusion_service.recording.tables import COASTING, LEVELS, Table, components, hold, levels, tabulate
 from schemas import Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
@@ -46,6 +59,10 @@ MAX_GENERATIONS = 1000
 """Runs of services that are numbered; those beyond are called by their generation."""
 FEW = 100
 """Components of one message whose ellipses are drawn finely."""
+TOLD = 8
+"""Newest messages of a source among which that is sought which a step could know."""
+USUAL = 0.8
+"""Share of the newest steps that the view along with a track holds whole."""
 LINK = 200
 """Opacity of the lines from local tracks to global ones."""
 WIDTH = 1.5
@@ -66,8 +83,11 @@ class Drawing:
         self.sources: dict[str, str] = {}
         self.colours: dict[str, palette.Colour] = {}
         self.centres: dict[str, palette.Colour] = {}
+        self._told: dict[str, deque[Table]] = {}
+        self._messages: dict[str, deque[tuple[LocalTracks, NDArray[np.bool_]]]] = {}
         self.linked: set[tuple[str, str]] = set()
         self._focus = focus
+        self._reaches: deque[float] = deque(maxlen=1000)
         self.reach = 1.0
         """Half the width, m, of the view that goes along with the `focus`."""
         self._scenarios: dict[str, str] = {}
@@ -135,12 +155,15 @@ class Drawing:
         ids = message.ids[sound]
         mass = None if message.existence is None else message.existence[sound]
         table = tabulate(message.epoch, message.time, ids, place, mass=mass)
+        if self._focus is not None:
+            self._messages.setdefault(message.source, deque(maxlen=TOLD)).append((message, sound))
         self._grow(table.place.xy, main=False)
         path = self.sources[message.source]
         period = self._info[message.source].period if message.source in self._info else DEFAULT_PERIOD
         keep = 0 if message.complete else round(KEPT_PERIODS * period * 1e9)
         over = self._components(f"{path}/components", message, sound, stamp, keep)
         table = self._trail(path, table, message.time, keep, stamp)
+        self._told.setdefault(message.source, deque(maxlen=TOLD)).append(table)
         self._tracks(path, table, [str(track) for track in table.ids.tolist()], stamp)
         self._ellipses(path, table, stamp)
         return over
@@ -172,7 +195,7 @@ class Drawing:
         return over
 
     def _links(self, message: GlobalTracks, table: Table, stamp: Stamp) -> None:
-        local = {name: self._tables[own] for name, own in self.sources.items() if own in self._tables}
+        local = {name: _as_of(told, message.time) for name, told in self._told.items()}
         for name, ends, z in links(message, table, local):
             key = message.source, name
             if not len(ends) and key not in self.linked:
@@ -200,8 +223,9 @@ class Drawing:
                 self.changed = True
 
     def _near(self, message: GlobalTracks, table: Table, track: int, stamp: Stamp) -> None:
-        local = {name: self._tables[own] for name, own in self.sources.items() if own in self._tables}
+        local = {name: self._predicted(name, message.time) for name in self._messages}
         truth = {name: self._tables[own] for name, own in self._scenarios.items() if own in self._tables}
+        here = 0.0
         for kind, name, part in near(message, track, table, local, truth):
             path = entity("near", message.source, *(() if kind == "global" else (kind, name)))
             colour = self.colours.get(name, palette.NEUTRAL)
@@ -209,16 +233,35 @@ class Drawing:
                 colour = self.centres[name] if kind == "global" else palette.TRUTH
             if self._tones.get(path) != colour:
                 bold = kind == "global"
-                self._style(path, colour, radius=4.0, width=WIDTH, alpha=255, labels=True, weighed=bold)
+                self._style(path, colour, radius=4.0, width=WIDTH, alpha=255, labels=False, weighed=bold)
             labels = [self.label(track) if kind == "global" else name] * len(part.ids)
             self._tracks(path, part, labels, stamp)
             if kind != "truth":
                 self._ellipses(path, part, stamp, weighed=kind == "global", dashed=True)
-            reach = np.abs(part.place.xy).max(initial=0.0)
-            reach += 3.0 * float(np.sqrt(part.place.covariance.trace(axis1=1, axis2=2).max(initial=0.0)))
-            if reach > self.reach:
-                self.reach = 1.2 * float(reach)
-                self.changed = True
+            here = max(here, extent(part))
+        if here > 0:
+            self._reaches.append(here)
+            reach = 1.2 * float(np.quantile(self._reaches, USUAL))
+            if not 0.75 < reach / self.reach < 1.25:
+                self.reach, self.changed = reach, True
+                self._rings(reach)
+
+    def _rings(self, reach: float) -> None:
+        """Circles at round distances from the `focus`, with their radii."""
+        rr, tone, text = self._rr, palette.packed(palette.GRID), palette.packed(palette.TRUTH)
+        radii, labels = rings(reach)
+        circles = [radius * RING.T for radius in radii]
+        self._columns.static("/near/grid", rr.LineStrips2D(circles, colors=[tone], radii=[-0.5], draw_order=1.0))
+        places = [(0.0, radius) for radius in radii]
+        self._columns.static("/near/grid/labels", rr.Points2D(places, labels=labels, colors=[text], radii=[-0.5]))
+
+    def _predicted(self, name: str, time: int) -> Table:
+        """The tracks of a source as last told at `time`, moved on to it by their velocities."""
+        past = [item for item in self._messages[name] if item[0].time <= time] or [self._messages[name][0]]
+        message, sound = past[-1]
+        means, covariances = predicted(message, time)
+        place = self._chart.place(means[sound], covariances[sound], message.space, message.frame, message.height)
+        return tabulate(message.epoch, message.time, message.ids[sound], place)
 
     def truth(self, message: Truth, stamp: Stamp) -> None:
         n = len(message.space)
@@ -234,6 +277,7 @@ class Drawing:
     def clear(self, source: str, stamp: Stamp) -> None:
         """Draw no tracks of `source` until it sends again."""
         own = entity("picture", "local", source)
+        self._told.pop(source, None)
         for path in (own, f"{own}/components", f"{own}/intensity"):
             table = self._tables.pop(path, None)
             if table is not None:
@@ -432,6 +476,12 @@ class Drawing:
         """South-west and north-east corner (2,) of the square that is seen at first, m: all that the grid covers, or
         the path of the `focus`."""
         return self._sight or self._grid
+
+
+def _as_of(told: Sequence[Table], time: int) -> Table:
+    """The newest of `told`, in the order they came, that is not of after `time`; the oldest if all are."""
+    past = [table for table in told if not len(table.ids) or table.times.max() <= time]
+    return past[-1] if past else told[0]
 
 
 def _links_path(centre: str, source: str) -> str:

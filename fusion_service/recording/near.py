@@ -1,11 +1,11 @@
 """One global track and what is told of its object, seen from itself: a view that goes along.
 
 /near/{centre}                       the track, always at the origin;  .../ellipses
-/near/{centre}/local/{source}        the local tracks it was fused from, as their sources last told, moved by minus its
-                                     place;  .../ellipses
+/near/{centre}/local/{source}        the local tracks it was fused from;  .../ellipses
 /near/{centre}/truth/{scenario}      true objects within a few of its sigmas
 
-Errors and covariances are seen at their true size, however far the track goes.
+All but the truth are at the time of the step: a local track is moved on by its velocity (x += vx dt, with the
+covariance; no process noise). Errors and covariances are seen at their true size, however far the track goes.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.recording.geometry import moments
 from fusion_service.recording.tables import Table
-from schemas import GlobalTracks
+from schemas import GlobalTracks, LocalTracks
 
-__all__ = ["Near", "near"]
+__all__ = ["Near", "extent", "near", "predicted"]
 
 Floats = NDArray[np.float64]
 
@@ -57,6 +58,24 @@ def near(
     for name, table in truth.items():
         there = np.flatnonzero(np.linalg.norm(table.place.xy - origin, axis=1) <= reach)
         yield Near("truth", name, _moved(table, there, origin))
+
+
+def predicted(message: LocalTracks, time: int) -> tuple[Floats, Floats]:
+    """Means (T, n) and covariances (T, n, n) of the tracks, moved on to `time` by their velocities."""
+    means, covariances = moments(message)
+    F = np.eye(len(message.space))
+    for name in "xyz":
+        if name in message.space and f"v{name}" in message.space:
+            F[message.space.index(name), message.space.index(f"v{name}")] = (time - message.time) / 1e9
+    return means @ F.T, F @ covariances @ F.T
+
+
+def extent(table: Table) -> float:
+    """How far the 95 % ellipses, about, reach from the origin, m; 0 without any."""
+    if not len(table.ids):
+        return 0.0
+    spread = np.sqrt(table.place.covariance.trace(axis1=1, axis2=2))
+    return float((np.linalg.norm(table.place.xy, axis=1) + 2.5 * spread).max())
 
 
 def _moved(table: Table, rows: NDArray[np.intp], origin: Floats) -> Table:
