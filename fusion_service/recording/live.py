@@ -40,7 +40,7 @@ ROW = 500
 def address(text: str) -> tuple[str, int]:
     """Host and port of HOST:PORT, HOST or PORT. `ValueError` in one line."""
     host, _, port = text.rpartition(":") if ":" in text else ("", "", text) if text.isdigit() else (text, "", "")
-    number = int(port) if port.isdigit() else DEFAULT_ADDRESS[1] if not port else 0
+    number = int(port) if port.isdigit() else DEFAULT_ADDRESS[1] if not port and ":" not in text else 0
     if not 0 < number < 65536:
         raise ValueError(f"{text!r} is not HOST:PORT, HOST or PORT")
     return host.strip("[]") or DEFAULT_ADDRESS[0], number

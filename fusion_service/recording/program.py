@@ -24,5 +24,6 @@ def quiet(home: Path) -> dict[str, str]:
     """An environment in which it sends no usage data, with its settings in the folder `home`."""
     settings = home / "rerun" / "analytics.json"
     settings.parent.mkdir(parents=True, exist_ok=True)
-    settings.write_text(json.dumps({"analytics_enabled": False, "analytics_id": "", "metadata": {}}))
+    said = {"analytics_enabled": False, "analytics_id": "none", "metadata": {}, "config_file_path": str(settings)}
+    settings.write_text(json.dumps(said | {"data_dir_path": str(home / "data")}))
     return os.environ | {"XDG_CONFIG_HOME": str(home)}
