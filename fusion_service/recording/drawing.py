@@ -182,7 +182,7 @@ class Drawing:
         self._grow(table.place.xy, main=True)
         path = entity("picture", "global", message.source)
         if self._first(path):
-            self.centres[message.source] = palette.FUSED
+            self.centres = palette.centre_colours([*self.centres, message.source])
             self._recolour = True
         over = self._components(f"{path}/components", message, sound, stamp)
         table = self._trail(path, table, message.time, 0, stamp)
@@ -384,10 +384,9 @@ class Drawing:
         if not self._recolour:
             return
         self._recolour = False
-        for name, colour in palette.centre_colours(self.centres).items():
+        for name, colour in self.centres.items():
             path = entity("picture", "global", name)
             if self._tones.get(path) != colour:
-                self.centres[name] = colour
                 self._style(path, colour, radius=4.5, width=WIDTH, alpha=255, labels=True, weighed=True)
         for name, colour in palette.source_colours(self.sources).items():
             if self.colours.get(name) == colour:

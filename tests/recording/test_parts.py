@@ -38,9 +38,9 @@ def fly(folder: Path, said: list[Sent], rotation: Rotation, every: int = 20) -> 
 
 @pytest.fixture(scope="module")
 def cut(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Sent]]:
-    """The whole made-up mission in parts of about 100 kB."""
-    folder, said = tmp_path_factory.mktemp("parts") / "mission", list(mission())
-    fly(folder, said, Rotation(size=150_000))
+    """The first minute of the made-up mission in parts."""
+    folder, said = tmp_path_factory.mktemp("parts") / "mission", list(mission(60))
+    fly(folder, said, Rotation(size=80_000))
     assert len(parts(folder)) >= 4
     return folder, said
 
