@@ -243,6 +243,8 @@ def _record(args: argparse.Namespace, stop: threading.Event) -> None:
         raise FileExistsError(f"{path} exists already: name another file, or move it away")
     live = None
     if args.live or args.live_web:
+        if args.no_draw:
+            raise ConfigError(["fusion-service record: --live shows what is drawn: leave out --no-draw"])
         live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
         print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
     with open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop) as bus:

@@ -8,6 +8,7 @@ oldest are dropped and counted, and nothing comes back to the recorder. The mess
 from __future__ import annotations
 
 import contextlib
+import ipaddress
 import logging
 import socket
 import subprocess
@@ -61,7 +62,8 @@ class Live:
         _check_free(host, port)
         self.dropped = 0
         self.page: str | None = None
-        sink = rr.GrpcServerSink(host, port, server_memory_limit=SERVED)
+        beyond = [f"http://*:{web}"] if web is not None and not _is_loopback(host) else []
+        sink = rr.GrpcServerSink(host, port, server_memory_limit=SERVED, cors_allow_origin=beyond)
         self.url = f"rerun+http://{_shown(host)}:{port}/proxy"
         self._stream = rr.RecordingStream("track-fusion-centre", send_properties=True)
         self._stream.set_sinks(sink)
@@ -209,6 +211,10 @@ def _resolved(host: str) -> str:
         return str(socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)[0][4][0])
     except OSError as error:
         raise OSError(f"live: {host} is no address of this machine ({error})") from None
+
+
+def _is_loopback(host: str) -> bool:
+    return ipaddress.ip_address(host).is_loopback
 
 
 def _shown(host: str) -> str:

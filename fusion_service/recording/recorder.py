@@ -265,7 +265,7 @@ class Recorder:
         self._repeated = self._arrival
         self._scene.restart()
         self._columns.restart(self._stream, now)
-        self._say(f"part {self.path.name} goes on from {before.name}", now.received)
+        self._say(f"part {self.path.name} goes on from {before.name}", now.received, "INFO")
         self._write(0.0)
         self._flush()
         folder.retain(self.path)
@@ -296,8 +296,8 @@ class Recorder:
         import_rerun().unregister_shutdown()
         threading.Thread(target=lambda _: threading.Event().wait(), args=(self._stream,), daemon=True).start()
 
-    def _say(self, text: str, received: int) -> None:
-        self._scene.journal.say("recorder", "WARN", text, Stamp(received, self._scene.now))
+    def _say(self, text: str, received: int, level: str = "WARN") -> None:
+        self._scene.journal.say("recorder", level, text, Stamp(received, self._scene.now))
 
     def _write(self, interval: float, patience: float = PATIENCE) -> None:
         self._raw.send()

@@ -101,10 +101,9 @@ def test_several_centres_have_colours_and_pictures_of_their_own(tmp_path: Path) 
 
 
 def layout(path: Path) -> str:
+    """All layouts that were said, in no order."""
     reader = RrdReader(path)
-    last = reader.blueprints()[-1]
-    batches = [chunk.to_record_batch() for chunk in reader.stream(store=last)]
-    return " ".join(str(batch) for batch in batches)
+    return " ".join(str(chunk.to_record_batch()) for one in reader.blueprints() for chunk in reader.stream(store=one))
 
 
 # ------------------------------------------------------------------ one track
