@@ -21,7 +21,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +49,7 @@ __all__ = ["Drawing"]
 
 Floats = NDArray[np.float64]
 U64 = NDArray[np.uint64]
+T = TypeVar("T")
 
 DEFAULT_PERIOD = 10.0
 KEPT_PERIODS = 3.0
@@ -59,8 +60,9 @@ MAX_GENERATIONS = 1000
 """Runs of services that are numbered; those beyond are called by their generation."""
 FEW = 100
 """Components of one message whose ellipses are drawn finely."""
-TOLD = 8
-"""Newest messages of a source among which that is sought which a step could know."""
+TOLD, TOLD_TRACKS = 64, 5000
+"""Newest messages of a source, and tracks in them, among which that is sought which a step could know: in a fast
+playback the sources are far ahead of the centre."""
 USUAL = 0.8
 """Share of the newest steps that the view along with a track holds whole."""
 LINK = 200
@@ -156,14 +158,14 @@ class Drawing:
         mass = None if message.existence is None else message.existence[sound]
         table = tabulate(message.epoch, message.time, ids, place, mass=mass)
         if self._focus is not None:
-            self._messages.setdefault(message.source, deque(maxlen=TOLD)).append((message, sound))
+            _remember(self._messages.setdefault(message.source, deque()), (message, sound), len(ids))
         self._grow(table.place.xy, main=False)
         path = self.sources[message.source]
         period = self._info[message.source].period if message.source in self._info else DEFAULT_PERIOD
         keep = 0 if message.complete else round(KEPT_PERIODS * period * 1e9)
         over = self._components(f"{path}/components", message, sound, stamp, keep)
         table = self._trail(path, table, message.time, keep, stamp)
-        self._told.setdefault(message.source, deque(maxlen=TOLD)).append(table)
+        _remember(self._told.setdefault(message.source, deque()), table, len(table.ids))
         self._tracks(path, table, [str(track) for track in table.ids.tolist()], stamp)
         self._ellipses(path, table, stamp)
         return over
@@ -195,7 +197,8 @@ class Drawing:
         return over
 
     def _links(self, message: GlobalTracks, table: Table, stamp: Stamp) -> None:
-        local = {name: _as_of(told, message.time) for name, told in self._told.items()}
+        known = ((name, _as_of(told, message.time)) for name, told in self._told.items())
+        local = {name: table for name, table in known if table is not None}
         for name, ends, z in links(message, table, local):
             key = message.source, name
             if not len(ends) and key not in self.linked:
@@ -223,7 +226,8 @@ class Drawing:
                 self.changed = True
 
     def _near(self, message: GlobalTracks, table: Table, track: int, stamp: Stamp) -> None:
-        local = {name: self._predicted(name, message.time) for name in self._messages}
+        known = ((name, self._predicted(name, message.time)) for name in self._messages)
+        local = {name: one for name, one in known if one is not None}
         truth = {name: self._tables[own] for name, own in self._scenarios.items() if own in self._tables}
         here = 0.0
         for kind, name, part in near(message, track, table, local, truth):
@@ -255,9 +259,11 @@ class Drawing:
         places = [(0.0, radius) for radius in radii]
         self._columns.static("/near/grid/labels", rr.Points2D(places, labels=labels, colors=[text], radii=[-0.5]))
 
-    def _predicted(self, name: str, time: int) -> Table:
+    def _predicted(self, name: str, time: int) -> Table | None:
         """The tracks of a source as last told at `time`, moved on to it by their velocities."""
-        past = [item for item in self._messages[name] if item[0].time <= time] or [self._messages[name][0]]
+        past = [item for item in self._messages[name] if item[0].time <= time]
+        if not past:
+            return None
         message, sound = past[-1]
         means, covariances = predicted(message, time)
         place = self._chart.place(means[sound], covariances[sound], message.space, message.frame, message.height)
@@ -477,10 +483,18 @@ class Drawing:
         return self._sight or self._grid
 
 
-def _as_of(told: Sequence[Table], time: int) -> Table:
-    """The newest of `told`, in the order they came, that is not of after `time`; the oldest if all are."""
+def _as_of(told: Sequence[Table], time: int) -> Table | None:
+    """The newest of `told`, in the order they came, that is not of after `time`."""
     past = [table for table in told if not len(table.ids) or table.times.max() <= time]
-    return past[-1] if past else told[0]
+    return past[-1] if past else None
+
+
+def _remember(held: deque[T], item: T, tracks: int) -> None:
+    """Add `item`, and drop the oldest so that at most `TOLD` stay, and no more than `TOLD_TRACKS` if all have `tracks`
+    tracks."""
+    held.append(item)
+    while len(held) > max(1, min(TOLD, TOLD_TRACKS // max(tracks, 1))):
+        held.popleft()
 
 
 def _links_path(centre: str, source: str) -> str:

@@ -58,7 +58,7 @@ def test_links_leave_with_their_source_and_go_to_tracks_of_the_steps_own_time(fl
 
 def test_a_step_is_linked_to_what_it_could_know(tmp_path: Path) -> None:
     """Local tracks that came before the step's result but are newer than it are not those it was fused from."""
-    said = list(mission(6))
+    said = list(mission(20))
     late = [s for s in said if s.key == global_key("main", "tracks")]
     rest = [s for s in said if s.key != global_key("main", "tracks")]
     path = tmp_path / "a.rrd"
