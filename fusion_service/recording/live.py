@@ -126,7 +126,7 @@ class Live:
             self._change.notify()
         if self._web is not None:
             self._web.close()
-        self._thread.join(2 * PATIENCE)
+        self._thread.join(PATIENCE + 0.2)
         if self.dropped:
             log.warning("live: %d rows were not shown to viewers that did not keep up", self.dropped)
         if self._thread.is_alive() or self._stalled:  # it would wait for the viewer, here or at the end of the process

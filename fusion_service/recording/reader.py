@@ -12,7 +12,6 @@ The file (RRF2) is a header of 12 bytes, then records: kind and length (u64 each
 
 from __future__ import annotations
 
-import contextlib
 import heapq
 import logging
 import os
@@ -77,33 +76,37 @@ def _read_parts(folder: Path) -> Iterator[RawMessage]:
     for number, path in zip(numbers, there, strict=True):
         if number > before + 1:
             log.warning("%s: no part %d%s", folder, before + 1, f" to {number - 1}" if number > before + 2 else "")
-        before, first = number, True
+        before, ended, begun = number, last, 0
+        begins: list[str] = []
         try:
-            for message, standing in _read_file(path):
-                if standing:
-                    if infos.get(message.key) == message.data:
-                        continue
-                elif first:
-                    first = False
-                    if last and _begins(path) == "resume":
-                        gap = (message.received - last) / 1e9
-                        log.warning("%s: %.1f s without a recorder before part %d", folder, gap, number)
+            for message, standing in _read_file(path, begins):
+                if standing and infos.get(message.key) == message.data:
+                    continue
                 if message.key.endswith("/info"):
                     infos[message.key] = message.data
                 if not standing:
-                    last = message.received
+                    begun, last = begun or message.received, message.received
                 yield message._replace(arrival=arrival)
                 arrival += 1
         except ReviewError as error:
             log.warning("part left out: %s", error)
+        if ended and begun and any("resume" in cell for cell in begins):
+            log.warning("%s: %.1f s without a recorder before part %d", folder, (begun - ended) / 1e9, number)
 
 
-def _read_file(path: Path) -> Iterator[tuple[RawMessage, bool]]:
-    """Each message, and whether it is repeated from an earlier part."""
+def _read_file(path: Path, begins: list[str] | None = None) -> Iterator[tuple[RawMessage, bool]]:
+    """Each message, and whether it is repeated from an earlier part. `begins` is told how the part began, as `Recorder`
+    wrote it."""
+    content = ["/raw/**"] if begins is None else ["/raw/**", "/__properties/part"]
     with tempfile.TemporaryDirectory(prefix="rrd-") as folder:
         waiting: list[tuple[RawMessage, bool]] = []
         following = 0
-        for chunk in _open_whole(path, Path(folder)).stream().filter(content="/raw/**"):
+        for chunk in _open_whole(path, Path(folder)).stream().filter(content=content):
+            if begins is not None and not chunk.entity_path.startswith("/raw/"):
+                batch = chunk.to_record_batch()
+                if "begins" in batch.schema.names:
+                    begins += [str(cell) for cell in batch.column("begins").to_pylist()]
+                continue
             standing = chunk.entity_path.startswith("/raw/standing/")
             for message in _rows(chunk):
                 heapq.heappush(waiting, (message, standing))
@@ -112,16 +115,6 @@ def _read_file(path: Path) -> Iterator[tuple[RawMessage, bool]]:
                 following += 1
         while waiting:  # after a gap: the part of the last flush that a torn file has lost
             yield heapq.heappop(waiting)
-
-
-def _begins(path: Path) -> str:
-    """How a part began, as `Recorder` wrote it; empty if it did not."""
-    with contextlib.suppress(_TornError):
-        for chunk in _open(path).stream().filter(content="/__properties/part"):
-            batch = chunk.to_record_batch()
-            if "begins" in batch.schema.names:
-                return str(batch.column("begins").to_pylist()[0][0])
-    return ""
 
 
 def recording_id(path: Path) -> str:
