@@ -31,9 +31,13 @@ __all__ = [
     "raw",
     "scalars",
     "texts",
+    "weight",
 ]
 
 log = logging.getLogger(__name__)
+
+ROW = 500
+"""Bytes of a row besides its arrays, about."""
 
 Floats = NDArray[np.float64]
 Classes = NDArray[np.uint16]
@@ -117,6 +121,8 @@ class Columns:
         self._standing: dict[tuple[str, Build], Row] = {}
         self._statics: dict[str, dict[str, Any]] = {}
         self.waiting = 0
+        """Rows, and about their bytes, that are not written yet."""
+        self.bytes_waiting = 0
         self.sent = 0
         self.failed = 0
 
@@ -126,6 +132,7 @@ class Columns:
         key = (path, build, stamp.time is None, stamp.arrival is None)
         self._rows.setdefault(key, []).append((stamp, content))
         self.waiting += 1
+        self.bytes_waiting += weight(content)
         if stands or self._mirror is not None:
             row = Row(path, build, stamp, content)
             if stands:
@@ -168,7 +175,7 @@ class Columns:
     def send(self) -> None:
         """Write every row that waits, each entity's in the order they were added."""
         rr, rows, self._rows = self._rr, self._rows, {}
-        self.waiting = 0
+        self.waiting = self.bytes_waiting = 0
         for (path, build, timeless, uncounted), added in rows.items():
             stamps = [stamp for stamp, _ in added]
             indexes = [_timestamps(rr, "received", [stamp.received for stamp in stamps])]
@@ -183,6 +190,13 @@ class Columns:
                 log.exception("%d rows of %s cannot be written", len(added), path)
             else:
                 self.sent += len(added)
+
+
+def weight(content: Any) -> int:
+    """Bytes of a row, about."""
+    if isinstance(content, Points):
+        return ROW + 2 * content.plane.nbytes + 60 * len(content.labels or ())
+    return ROW + 2 * content.plane.nbytes if isinstance(content, Lines) else ROW
 
 
 def _timestamps(rr: Any, name: str, times: Sequence[int | None]) -> Any:

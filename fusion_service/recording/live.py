@@ -19,7 +19,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from fusion_service.recording.columns import Columns, Lines, Points, Row, import_rerun
+from fusion_service.recording.columns import Columns, Row, import_rerun, weight
 from fusion_service.recording.program import find_program, quiet
 
 __all__ = ["DEFAULT_ADDRESS", "DEFAULT_WEB_PORT", "Live", "address"]
@@ -34,8 +34,6 @@ HELD = 64 * 2**20
 """Bytes that wait for a server that does not take them."""
 PATIENCE = 0.5
 """Seconds between looks at a server that does not take what it has."""
-ROW = 500
-"""Bytes of a row besides its arrays, about."""
 
 
 def address(text: str) -> tuple[str, int]:
@@ -92,7 +90,7 @@ class Live:
     def row(self, row: Row) -> None:
         """One row, sent with the next `push`."""
         self._fresh.append(row)
-        self._weight += ROW + _weight(row.content)
+        self._weight += weight(row.content)
 
     def static(self, path: str, batches: dict[str, Any]) -> None:
         """What holds at all times; never dropped."""
@@ -105,10 +103,10 @@ class Live:
 
     def push(self) -> None:
         """Hand over what came since the last push; never waits."""
-        rows, weight, self._fresh, self._weight = self._fresh, self._weight, [], 0
+        rows, size, self._fresh, self._weight = self._fresh, self._weight, [], 0
         with self._change:
-            self._waiting.append((weight, rows))
-            self._held += weight
+            self._waiting.append((size, rows))
+            self._held += size
             while self._held > HELD and len(self._waiting) > 1:
                 old, lost = self._waiting.popleft()
                 self._held -= old
@@ -196,14 +194,6 @@ class _Page:
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(2.0)
         self._home.cleanup()
-
-
-def _weight(content: Any) -> int:
-    if isinstance(content, Points):
-        return 2 * content.plane.nbytes + 60 * len(content.labels or ())
-    if isinstance(content, Lines):
-        return 2 * content.plane.nbytes
-    return 0
 
 
 def _resolved(host: str) -> str:

@@ -45,8 +45,10 @@ log = logging.getLogger(__name__)
 APPLICATION = "track-fusion-centre"
 DRAWN_EVERY = 10.0
 MANY = 20_000
-"""Seconds, or rows, between writes of what was drawn: each costs a chunk for each entity, for which Rerun keeps some
-400 B in memory until the file is closed. A killed recorder loses so much of the picture, nothing of the messages."""
+HEAVY = 32 * 2**20
+"""Seconds, or rows, or bytes between writes of what was drawn: each costs a chunk for each entity, for which Rerun
+keeps some 4 kB in memory until the file is closed. A killed recorder loses so much of the picture, nothing of the
+messages."""
 FLUSH = 10.0
 """Seconds that the disk may take before it counts as broken."""
 RESERVE = 64 * 2**20
@@ -305,7 +307,8 @@ class Recorder:
             self._say(f"{count} messages on {key} do not decode: {reason}", time.time_ns())
         self._bad.clear()
         self._scene.draw(patience)
-        if time.monotonic() - self._drawn_last < interval and self._columns.waiting < MANY:
+        few = self._columns.waiting < MANY and self._columns.bytes_waiting < HEAVY
+        if few and time.monotonic() - self._drawn_last < interval:
             return
         self._drawn_last = time.monotonic()
         self._columns.send()
