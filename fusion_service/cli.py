@@ -10,9 +10,10 @@ import dataclasses
 import math
 import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from fusion_service import units
 from fusion_service.commands import COMMANDS
 from fusion_service.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.process import set_up_logging, stop_on_signals
@@ -40,6 +41,32 @@ def _speed(text: str) -> float:
 def _seed(text: str) -> int:
     if not (text.isascii() and text.isdigit() and len(text) < 19):
         raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 0")
+    return int(text)
+
+
+def _unit(kind: str) -> Callable[[str], float]:
+    def read(text: str) -> float:
+        try:
+            value: float = getattr(units, kind)(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+        return value
+
+    return read
+
+
+def _address(text: str) -> tuple[str, int]:
+    from fusion_service.recording.live import address
+
+    try:
+        return address(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+
+
+def _port(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a port")
     return int(text)
 
 
@@ -81,8 +108,20 @@ def _parser() -> argparse.ArgumentParser:
     )
     run.add_argument("--hub", action="store_true", help="hold a hub in this process too (the smallest installation)")
 
-    record = command("record", "Record everything on the bus.", "fusion-service record --out mission.rrd")
-    record.add_argument("--out", metavar="FILE", help="recording (default runs/mission-<UTC time>.rrd)")
+    record = command(
+        "record",
+        "Record everything on the bus.",
+        "fusion-service record --out mission.rrd\n"
+        "  fusion-service record --out mission/ --rotate-every 1h --keep-for 7d     parts 0001.rrd, 0002.rrd, ...\n"
+        "  fusion-service record --live       look on with: rerun --connect rerun+http://127.0.0.1:9876/proxy\n"
+        "  fusion-service record --live-web   look on in a browser",
+    )
+    record.add_argument(
+        "--out",
+        metavar="PATH",
+        help="recording, a new file; or a folder (a name that ends with /, or exists) of parts, which is gone on with "
+        "(default runs/mission-<UTC time>.rrd)",
+    )
     record.add_argument(
         "--connect",
         action="append",
@@ -92,6 +131,34 @@ def _parser() -> argparse.ArgumentParser:
     )
     record.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
     record.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
+    record.add_argument(
+        "--flush", type=_unit("duration"), default=1.0, metavar="TIME", help="what a kill may cost at most (default 1s)"
+    )
+    record.add_argument("--no-draw", action="store_true", help="record the messages alone, without the picture")
+    weeks = record.add_argument_group("for weeks", "any of these makes the recording a folder of parts")
+    weeks.add_argument("--rotate-size", type=_unit("size"), metavar="SIZE", help="of a part (default 500MB)")
+    weeks.add_argument("--rotate-every", type=_unit("duration"), metavar="TIME", help="time of a part, as in 1h")
+    weeks.add_argument(
+        "--keep-size", type=_unit("size"), metavar="SIZE", help="delete the oldest parts beyond 20GB, say"
+    )
+    weeks.add_argument("--keep-for", type=_unit("duration"), metavar="TIME", help="delete parts older than 7d, say")
+    live = record.add_argument_group("live")
+    live.add_argument(
+        "--live",
+        nargs="?",
+        const="127.0.0.1:9876",
+        type=_address,
+        metavar="HOST:PORT",
+        help="serve the picture to open viewers (default 127.0.0.1:9876; any other host opens it to the network)",
+    )
+    live.add_argument(
+        "--live-web",
+        nargs="?",
+        const=9090,
+        type=_port,
+        metavar="PORT",
+        help="and the viewer as a page, on the host of --live (default port 9090)",
+    )
 
     demo = command(
         "demo",
@@ -158,14 +225,40 @@ def _run(args: argparse.Namespace, stop: threading.Event) -> None:
 
 def _record(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.bus import open_bus
-    from fusion_service.recording import default_path, run_recorder
+    from fusion_service.config import ConfigError
+    from fusion_service.recording import Rotation, default_path, run_recorder
+    from fusion_service.recording.live import DEFAULT_ADDRESS, Live
+    from fusion_service.recording.parts import is_folder
 
-    path = Path(args.out) if args.out else default_path()
+    limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
+    rotation = None
+    if any(limit is not None for limit in limits) or (args.out and is_folder(args.out)):
+        try:
+            rotation = Rotation(*limits)
+        except ValueError as error:
+            raise ConfigError([f"fusion-service record: {error}"]) from None
+    path = Path(args.out) if args.out else default_path(suffix=".rrd" if rotation is None else "")
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.exists():
+    if path.exists() and (rotation is None or path.is_file()):
         raise FileExistsError(f"{path} exists already: name another file, or move it away")
+    live = None
+    if args.live or args.live_web:
+        if args.no_draw:
+            raise ConfigError(["fusion-service record: --live shows what is drawn: leave out --no-draw"])
+        live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
+        print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
     with open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop) as bus:
-        run_recorder(bus, path, realm=args.realm, stop=stop, cutoff=args.cutoff)
+        run_recorder(
+            bus,
+            path,
+            realm=args.realm,
+            stop=stop,
+            cutoff=args.cutoff,
+            draw=not args.no_draw,
+            rotation=rotation,
+            live=live,
+            interval=args.flush,
+        )
 
 
 def _demo(args: argparse.Namespace, stop: threading.Event) -> None:

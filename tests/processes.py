@@ -84,6 +84,12 @@ class Program:
         line, _, self._lines = self._lines.partition(b"\n")
         return line.decode()
 
+    def tell(self, line: str = "") -> None:
+        """Write a line that it reads from stdin."""
+        assert self._process.stdin is not None
+        self._process.stdin.write(f"{line}\n".encode())
+        self._process.stdin.flush()
+
     def end(self, timeout: float = 10.0) -> tuple[int, str]:
         """Wait for it to end by itself: (exit code, what it wrote to stderr)."""
         _, errors = self._process.communicate(timeout=timeout)

@@ -29,8 +29,9 @@ TICK = 2000
 def write_view(mission: Mission, out: str | Path, stop: Event | None = None) -> int:
     """Write the track of `mission.story` alone into the recording `out`. Returns how many messages it has."""
     stop = stop or Event()
+    assert mission.story is not None, "the mission is read with a track"
     near = _near(mission, stop)
-    with _recorder(out, mission) as recorder:
+    with Recorder(out, realm=mission.centre.realm, focus=mission.story.track) as recorder:
         for raw in read(mission.path):
             if stop.is_set():
                 break
@@ -41,11 +42,6 @@ def write_view(mission: Mission, out: str | Path, stop: Event | None = None) -> 
                 if recorder.messages % TICK == 0:
                     recorder.tick()
     return recorder.messages
-
-
-def _recorder(out: str | Path, mission: Mission) -> Recorder:
-    """The recorder that draws it: a layout for a single track belongs here."""
-    return Recorder(out, realm=mission.centre.realm)
 
 
 def _read(mission: Mission, text: str, data: bytes) -> Message | None:

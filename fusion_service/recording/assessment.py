@@ -26,6 +26,8 @@ Floats = NDArray[np.float64]
 
 HELD = 512
 """Truth messages of a scenario, and global steps of a centre, that wait for each other."""
+HELD_TRACKS = 50_000
+"""Of those steps together: a mission without truth holds no more."""
 SPREADS = 10.0
 SMALLEST = 20.0
 """Without a given cut-off: so many typical standard deviations of the position, and at least so many metres."""
@@ -33,7 +35,8 @@ SMALLEST = 20.0
 
 class Score(NamedTuple):
     """One global step of `centre`: for each true object (T,) the distance (m) and NEES / dimension of the track
-    that is assigned to it, NaN without one; `bounds`: where the mean NEES lies with 95 % for a consistent centre."""
+    that is assigned to it, NaN without one, and the track's id (0: none); `bounds`: where the mean NEES lies with 95 %
+    for a consistent centre."""
 
     centre: str
     stamp: Stamp
@@ -41,6 +44,7 @@ class Score(NamedTuple):
     error: Floats
     nees: Floats
     dimension: int
+    tracks: NDArray[np.uint64]
 
     @property
     def assigned(self) -> int:
@@ -68,6 +72,9 @@ class Assessment:
 
     def step(self, message: GlobalTracks, stamp: Stamp) -> None:
         self._steps.append((message, stamp))
+        held = sum(len(one.ids) for one, _ in self._steps)
+        while held > HELD_TRACKS and len(self._steps) > 1:
+            held -= len(self._steps.popleft()[0].ids)
 
     def scores(self) -> Iterator[Score]:
         """Every step whose time the truth has reached; the others wait for it. `geodesy.FrameError` where the
@@ -97,7 +104,7 @@ class Assessment:
         shown = np.flatnonzero(message.status != STATUSES.index("tentative"))
         means, covariances = means[shown][:, index], covariances[shown][:, index][:, :, index]
         sound = np.isfinite(means).all(axis=1) & (np.linalg.det(covariances) > 0)
-        means, covariances = means[sound], covariances[sound]
+        means, covariances, shown = means[sound], covariances[sound], shown[sound]
         spread = np.sqrt(np.trace(covariances, axis1=1, axis2=2) / len(names))
         typical = float(np.median(spread)) if len(spread) else 0.0
         cutoff = self._cutoff or max(SMALLEST, SPREADS * typical)
@@ -107,7 +114,9 @@ class Assessment:
         apart = positions[found] - means[assignment[found]]
         error[found] = np.sqrt((apart * apart).sum(axis=1))
         nees[found] = metrics.nees(apart, covariances[assignment[found]]) / len(names)
-        return Score(message.source, stamp, ids, error, nees, len(names))
+        tracks = np.zeros(len(ids), dtype=np.uint64)
+        tracks[found] = message.ids[shown[assignment[found]]]
+        return Score(message.source, stamp, ids, error, nees, len(names), tracks)
 
 
 def _truth_at(held: list[Truth], message: GlobalTracks) -> tuple[NDArray[np.uint64], Floats, tuple[str, ...]] | None:

@@ -2,6 +2,9 @@
 
 A row logged alone costs Rerun 75-90 us, a row of a column about one: every message of a tick adds its rows
 here, and `Columns.send` writes them, one chunk for each entity, into the recording.
+
+What is static, and what stands at each place of the picture, is remembered, so that a new part of a recording can
+begin with it.
 """
 
 from __future__ import annotations
@@ -10,14 +13,31 @@ import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Columns", "Lines", "Points", "Stamp", "documents", "entity", "import_rerun", "raw", "scalars", "texts"]
+__all__ = [
+    "Columns",
+    "Lines",
+    "Mirror",
+    "Points",
+    "Row",
+    "Stamp",
+    "documents",
+    "entity",
+    "import_rerun",
+    "raw",
+    "scalars",
+    "texts",
+    "weight",
+]
 
 log = logging.getLogger(__name__)
+
+ROW = 500
+"""Bytes of a row besides its arrays, about."""
 
 Floats = NDArray[np.float64]
 Classes = NDArray[np.uint16]
@@ -73,40 +93,89 @@ class Lines:
 Build = Callable[[Any, Sequence[Any]], list[Any]]
 
 
-class Columns:
-    """Rows by entity, written to `stream` (a `rerun.RecordingStream`) by `send`."""
+class Row(NamedTuple):
+    """`content`, what `build` takes, for the entity `path`."""
 
-    def __init__(self, stream: Any) -> None:
+    path: str
+    build: Build
+    stamp: Stamp
+    content: Any
+
+
+class Mirror(Protocol):
+    """Who is shown every row and everything static as well."""
+
+    def row(self, row: Row) -> None: ...
+
+    def static(self, path: str, batches: dict[str, Any]) -> None: ...
+
+
+class Columns:
+    """Rows by entity, written to `stream` (a `rerun.RecordingStream`) by `send`, and shown to `mirror` at once."""
+
+    def __init__(self, stream: Any, mirror: Mirror | None = None) -> None:
         self._rr = import_rerun()
         self._stream = stream
+        self._mirror = mirror
         self._rows: dict[tuple[str, Build, bool, bool], list[tuple[Stamp, Any]]] = {}
+        self._standing: dict[tuple[str, Build], Row] = {}
+        self._statics: dict[str, dict[str, Any]] = {}
         self.waiting = 0
+        """Rows, and about their bytes, that are not written yet."""
+        self.bytes_waiting = 0
         self.sent = 0
         self.failed = 0
 
-    def add(self, path: str, build: Build, stamp: Stamp, content: Any) -> None:
-        """One row of `content` (what `build` takes) for the entity `path`."""
+    def add(self, path: str, build: Build, stamp: Stamp, content: Any, *, stands: bool = False) -> None:
+        """One row of `content` (what `build` takes) for the entity `path`. stands: it holds until the next one, in a
+        new part of the recording too."""
         key = (path, build, stamp.time is None, stamp.arrival is None)
         self._rows.setdefault(key, []).append((stamp, content))
         self.waiting += 1
+        self.bytes_waiting += weight(content)
+        if stands or self._mirror is not None:
+            row = Row(path, build, stamp, content)
+            if stands:
+                self._standing[path, build] = row
+            if self._mirror is not None:
+                self._mirror.row(row)
 
     def points(self, path: str, stamp: Stamp, content: Points) -> None:
-        self.add(path, _points, stamp, content)
+        self.add(path, _points, stamp, content, stands=True)
 
-    def lines(self, path: str, stamp: Stamp, content: Lines) -> None:
-        self.add(path, _lines, stamp, content)
+    def lines(self, path: str, stamp: Stamp, content: Lines, *, stands: bool = True) -> None:
+        self.add(path, _lines, stamp, content, stands=stands)
 
     def scalar(self, path: str, stamp: Stamp, value: float) -> None:
         self.add(path, scalars, stamp, value)
 
-    def static(self, path: str, *archetypes: Any) -> None:
-        """What holds at all times; the last one said counts."""
-        self._stream.log(path, *archetypes, static=True)
+    def static(self, path: str, *archetypes: Any, keep: bool = True) -> None:
+        """What holds at all times; the last one said counts. keep: in the parts of the recording to come too."""
+        batches = {
+            str(batch.component_descriptor()): batch for one in archetypes for batch in one.as_component_batches()
+        }
+        if keep:
+            self._statics.setdefault(path, {}).update(batches)
+        self._stream.log(path, list(batches.values()), static=True)
+        if self._mirror is not None:
+            self._mirror.static(path, batches)
+
+    def restart(self, stream: Any, at: Stamp) -> None:
+        """Go on in `stream`: with what is static, and with what stands, at the time `at` or its own later one. Rows
+        that wait are to be sent before."""
+        self._stream = stream
+        for path, batches in self._statics.items():
+            stream.log(path, list(batches.values()), static=True)
+        for path, build, stamp, content in self._standing.values():
+            now = at if stamp.time is None or at.time is None or stamp.time <= at.time else at._replace(time=stamp.time)
+            key = (path, build, now.time is None, True)
+            self._rows.setdefault(key, []).append((now, content))
+            self.waiting += 1
 
     def send(self) -> None:
         """Write every row that waits, each entity's in the order they were added."""
         rr, rows, self._rows = self._rr, self._rows, {}
-        self.waiting = 0
+        self.waiting = self.bytes_waiting = 0
         for (path, build, timeless, uncounted), added in rows.items():
             stamps = [stamp for stamp, _ in added]
             indexes = [_timestamps(rr, "received", [stamp.received for stamp in stamps])]
@@ -121,6 +190,13 @@ class Columns:
                 log.exception("%d rows of %s cannot be written", len(added), path)
             else:
                 self.sent += len(added)
+
+
+def weight(content: Any) -> int:
+    """Bytes of a row, about."""
+    if isinstance(content, Points):
+        return ROW + 2 * content.plane.nbytes + 60 * len(content.labels or ())
+    return ROW + 2 * content.plane.nbytes if isinstance(content, Lines) else ROW
 
 
 def _timestamps(rr: Any, name: str, times: Sequence[int | None]) -> Any:

@@ -7,6 +7,7 @@ Entities, each with its places on the plane and, where the frame allows, on the 
     /picture/global/{centre}             the same, labelled with the id; faint: tentative, dashed: coasting
     .../components                       the Gaussians of the tracks that are mixtures;  .../ellipses
     /picture/local/{source}/intensity    those of an intensity;                          .../ellipses
+    /picture/global/{centre}/links/...   lines from the local tracks of each source to the global ones: `links`
     /picture/truth/{scenario}            true positions;     .../trail
     /grid                                on the plane only
 
@@ -18,15 +19,30 @@ classes, only widths.
 
 from __future__ import annotations
 
-from typing import Any
+from collections import deque
+from collections.abc import Sequence
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.recording import palette
 from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
-from fusion_service.recording.geometry import CORNERS, Chart, Outline, Place, ellipses, grid, moments, outline
+from fusion_service.recording.geometry import (
+    CORNERS,
+    RING,
+    Chart,
+    Outline,
+    Place,
+    ellipses,
+    grid,
+    moments,
+    outline,
+    rings,
+)
 from fusion_service.recording.labels import Labels
+from fusion_service.recording.links import links
+from fusion_service.recording.near import extent, near, predicted
 from fusion_service.recording.tables import COASTING, LEVELS, Table, components, hold, levels, tabulate
 from schemas import Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
@@ -34,6 +50,7 @@ __all__ = ["Drawing"]
 
 Floats = NDArray[np.float64]
 U64 = NDArray[np.uint64]
+T = TypeVar("T")
 
 DEFAULT_PERIOD = 10.0
 KEPT_PERIODS = 3.0
@@ -42,20 +59,41 @@ FAINTEST = 40
 """Opacity of what hardly exists, of 255."""
 FEW = 100
 """Components of one message whose ellipses are drawn finely."""
+TOLD, TOLD_TRACKS = 64, 5000
+"""Newest messages of a source, and tracks in them, among which that is sought which a step could know: in a fast
+playback the sources are far ahead of the centre."""
+USUAL = 0.8
+"""Share of the newest steps that the view along with a track holds whole."""
+LINK = 200
+"""Opacity of the lines from local tracks to global ones."""
 WIDTH = 1.5
 """Of the ellipse of a global track, and of a component of weight 1, in points of the screen."""
 
 
 class Drawing:
-    """Turns messages into rows of `columns`. `chart` must be set before anything but `open_chart` is called."""
+    """Turns messages into rows of `columns`. `chart` must be set before anything but `open_chart` is called.
 
-    def __init__(self, columns: Columns, frame: Frame | None = None) -> None:
+    focus: the global track about whose path the view is, None for the whole picture.
+    """
+
+    def __init__(self, columns: Columns, frame: Frame | None = None, focus: int | None = None) -> None:
         self._rr = import_rerun()
         self._columns = columns
         self.chart: Chart | None = None if frame is None else Chart(frame)
         self.trails: list[str] = []
         self.sources: dict[str, str] = {}
         self.colours: dict[str, palette.Colour] = {}
+        self.centres: dict[str, palette.Colour] = {}
+        self._told: dict[str, deque[Table]] = {}
+        self._messages: dict[str, deque[tuple[LocalTracks, NDArray[np.bool_]]]] = {}
+        self.linked: set[tuple[str, str]] = set()
+        self._focus = focus
+        self._reaches: deque[float] = deque(maxlen=1000)
+        self.reach = 1.0
+        """Half the width, m, of the view that goes along with the `focus`."""
+        self._scenarios: dict[str, str] = {}
+        self._sight: tuple[Floats, Floats] | None = None
+        self._path: tuple[Floats, Floats] | None = None
         self.changed = True
         self.label = Labels()
         self._tables: dict[str, Table] = {}
@@ -109,12 +147,15 @@ class Drawing:
         ids = message.ids[sound]
         mass = None if message.existence is None else message.existence[sound]
         table = tabulate(message.epoch, message.time, ids, place, mass=mass)
+        if self._focus is not None:
+            _remember(self._messages.setdefault(message.source, deque()), (message, sound), len(ids))
         self._grow(table.place.xy, main=False)
         path = self.sources[message.source]
         period = self._info[message.source].period if message.source in self._info else DEFAULT_PERIOD
         keep = 0 if message.complete else round(KEPT_PERIODS * period * 1e9)
         over = self._components(f"{path}/components", message, sound, stamp, keep)
         table = self._trail(path, table, message.time, keep, stamp)
+        _remember(self._told.setdefault(message.source, deque()), table, len(table.ids))
         self._tracks(path, table, [str(track) for track in table.ids.tolist()], stamp)
         self._ellipses(path, table, stamp)
         return over
@@ -133,19 +174,97 @@ class Drawing:
         self._grow(table.place.xy, main=True)
         path = entity("picture", "global", message.source)
         if self._first(path):
-            self._style(path, palette.FUSED, radius=4.5, width=WIDTH, alpha=255, labels=True, weighed=True)
+            self.centres = palette.centre_colours([*self.centres, message.source])
+            self._recolour = True
         over = self._components(f"{path}/components", message, sound, stamp)
         table = self._trail(path, table, message.time, 0, stamp)
         self._tracks(path, table, [self.label(track) for track in table.ids.tolist()], stamp)
         self._ellipses(path, table, stamp, weighed=True, dashed=True)
+        self._links(message, table, stamp)
+        if self._focus is not None:
+            self._follow(table, self._focus)
+            self._near(message, table, self._focus, stamp)
         return over
+
+    def _links(self, message: GlobalTracks, table: Table, stamp: Stamp) -> None:
+        known = ((name, _as_of(told, message.time)) for name, told in self._told.items())
+        local = {name: table for name, table in known if table is not None}
+        for name, ends, z in links(message, table, local):
+            key = message.source, name
+            if not len(ends) and key not in self.linked:
+                continue
+            if key not in self.linked:
+                if name not in self.sources:
+                    continue
+                self.linked.add(key)
+                self._style_links(*key)
+            lengths = np.full(len(ends), 2)
+            content = self._lines(ends.reshape(-1, 2), z.reshape(-1), lengths)
+            self._columns.lines(_links_path(*key), stamp, content)
+
+    def _follow(self, table: Table, track: int) -> None:
+        """Let the view hold the track and half its ellipses around it; it grows in steps."""
+        for row in np.flatnonzero(table.ids == np.uint64(track)).tolist():
+            margin = 3.0 * float(np.sqrt(np.trace(table.place.covariance[row])))
+            low, high = table.place.xy[row] - margin, table.place.xy[row] + margin
+            if self._path is not None:
+                low, high = np.minimum(low, self._path[0]), np.maximum(high, self._path[1])
+            self._path = low, high
+            if self._sight is None or (low < self._sight[0]).any() or (high > self._sight[1]).any():
+                centre, half = (low + high) / 2, 0.65 * max(float((high - low).max()), 10.0)
+                self._sight = centre - half, centre + half
+                self.changed = True
+
+    def _near(self, message: GlobalTracks, table: Table, track: int, stamp: Stamp) -> None:
+        known = ((name, self._predicted(name, message.time)) for name in self._messages)
+        local = {name: one for name, one in known if one is not None}
+        truth = {name: self._tables[own] for name, own in self._scenarios.items() if own in self._tables}
+        here = 0.0
+        for kind, name, part in near(message, track, table, local, truth):
+            path = entity("near", message.source, *(() if kind == "global" else (kind, name)))
+            colour = self.colours.get(name, palette.NEUTRAL)
+            if kind != "local":
+                colour = self.centres[name] if kind == "global" else palette.TRUTH
+            if self._tones.get(path) != colour:
+                bold = kind == "global"
+                self._style(path, colour, radius=4.0, width=WIDTH, alpha=255, labels=False, weighed=bold)
+            labels = [self.label(track) if kind == "global" else name] * len(part.ids)
+            self._tracks(path, part, labels, stamp)
+            if kind != "truth":
+                self._ellipses(path, part, stamp, weighed=kind == "global", dashed=True)
+            here = max(here, extent(part))
+        if here > 0:
+            self._reaches.append(here)
+            reach = 1.2 * float(np.quantile(self._reaches, USUAL))
+            if not 0.75 < reach / self.reach < 1.25:
+                self.reach, self.changed = reach, True
+                self._rings(reach)
+
+    def _rings(self, reach: float) -> None:
+        """Circles at round distances from the `focus`, with their radii."""
+        rr, tone, text = self._rr, palette.packed(palette.GRID), palette.packed(palette.TRUTH)
+        radii, labels = rings(reach)
+        circles = [radius * RING.T for radius in radii]
+        self._columns.static("/near/grid", rr.LineStrips2D(circles, colors=[tone], radii=[-0.5], draw_order=1.0))
+        places = [(0.0, radius) for radius in radii]
+        self._columns.static("/near/grid/labels", rr.Points2D(places, labels=labels, colors=[text], radii=[-0.5]))
+
+    def _predicted(self, name: str, time: int) -> Table | None:
+        """The tracks of a source as last told at `time`, moved on to it by their velocities."""
+        past = [item for item in self._messages[name] if item[0].time <= time]
+        if not past:
+            return None
+        message, sound = past[-1]
+        means, covariances = predicted(message, time)
+        place = self._chart.place(means[sound], covariances[sound], message.space, message.frame, message.height)
+        return tabulate(message.epoch, message.time, message.ids[sound], place)
 
     def truth(self, message: Truth, stamp: Stamp) -> None:
         n = len(message.space)
         place = self._chart.place(message.means, np.zeros((len(message.ids), n, n)), message.space, message.frame)
         table = tabulate(message.epoch, message.time, message.ids, place)
         self._grow(table.place.xy, main=True)
-        path = entity("picture", "truth", message.source)
+        path = self._scenarios[message.source] = entity("picture", "truth", message.source)
         if self._first(path):
             self._style(path, palette.TRUTH, radius=2.0, width=0.5, alpha=255, labels=False)
         table = self._trail(path, table, message.time, 0, stamp)
@@ -154,6 +273,7 @@ class Drawing:
     def clear(self, source: str, stamp: Stamp) -> None:
         """Draw no tracks of `source` until it sends again."""
         own = entity("picture", "local", source)
+        self._told.pop(source, None)
         for path in (own, f"{own}/components", f"{own}/intensity"):
             table = self._tables.pop(path, None)
             if table is not None:
@@ -226,7 +346,8 @@ class Drawing:
             _, before, after = np.intersect1d(old.ids, new.ids, assume_unique=True, return_indices=True)
             ends = np.stack([old.place.xy[before], new.place.xy[after]], axis=1).reshape(-1, 2)
             z = np.stack([old.place.z[before], new.place.z[after]], axis=1).reshape(-1)
-            self._columns.lines(f"{path}/trail", stamp, self._lines(ends, z, np.full(len(before), 2)))
+            pieces = self._lines(ends, z, np.full(len(before), 2))
+            self._columns.lines(f"{path}/trail", stamp, pieces, stands=False)
         return self._hold(path, new, new.ids, time, keep)
 
     def _hold(self, path: str, new: Table, listed: U64, time: int, keep: int) -> Table:
@@ -259,6 +380,10 @@ class Drawing:
         if not self._recolour:
             return
         self._recolour = False
+        for name, colour in self.centres.items():
+            path = entity("picture", "global", name)
+            if self._tones.get(path) != colour:
+                self._style(path, colour, radius=4.5, width=WIDTH, alpha=255, labels=True, weighed=True)
         for name, colour in palette.source_colours(self.sources).items():
             if self.colours.get(name) == colour:
                 continue
@@ -268,6 +393,16 @@ class Drawing:
             self._columns.static(path, *_both(self._rr, "Points", colors=[palette.packed(colour)], radii=[-6.0]))
             edge = _both(self._rr, "Lines", colors=[palette.packed(colour, 110)], radii=[-0.75])
             self._columns.static(f"{path}/coverage", *edge)
+            for centre, source in self.linked:
+                if source == name:
+                    self._style_links(centre, source)
+
+    def _style_links(self, centre: str, source: str) -> None:
+        """Thin, under the tracks."""
+        tone = palette.packed(self.colours.get(source, palette.NEUTRAL), LINK)
+        path = _links_path(centre, source)
+        self._columns.static(path, *_both(self._rr, "Lines", colors=[tone], radii=[-0.5]))
+        self._columns.static(path, self._rr.LineStrips2D.from_fields(draw_order=10.0))
 
     def _style(
         self,
@@ -333,8 +468,27 @@ class Drawing:
 
     @property
     def bounds(self) -> tuple[Floats, Floats] | None:
-        """South-west and north-east corner (2,) of the square that the grid covers, m."""
-        return self._grid
+        """South-west and north-east corner (2,) of the square that is seen at first, m: all that the grid covers, or
+        the path of the `focus`."""
+        return self._sight or self._grid
+
+
+def _as_of(told: Sequence[Table], time: int) -> Table | None:
+    """The newest of `told`, in the order they came, that is not of after `time`."""
+    past = [table for table in told if not len(table.ids) or table.times.max() <= time]
+    return past[-1] if past else None
+
+
+def _remember(held: deque[T], item: T, tracks: int) -> None:
+    """Add `item`, and drop the oldest so that at most `TOLD` stay, and no more than `TOLD_TRACKS` if all have `tracks`
+    tracks."""
+    held.append(item)
+    while len(held) > max(1, min(TOLD, TOLD_TRACKS // max(tracks, 1))):
+        held.popleft()
+
+
+def _links_path(centre: str, source: str) -> str:
+    return entity("picture", "global", centre, "links", source)
 
 
 def _both(rr: Any, kind: str, **fields: Any) -> tuple[Any, ...]:

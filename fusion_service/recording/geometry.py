@@ -17,7 +17,7 @@ from fusion_service import geodesy
 from schemas import Disk, Ecef, Enu, Frame, Height, LocalIntensity, Polygon, Sector, SensorInfo
 from schemas.messages import GlobalTracks, LocalTracks
 
-__all__ = ["Chart", "Outline", "Place", "ellipses", "grid", "moments", "outline"]
+__all__ = ["RING", "Chart", "Outline", "Place", "ellipses", "grid", "moments", "outline", "rings"]
 
 Floats = NDArray[np.float64]
 Tracks = LocalTracks | GlobalTracks
@@ -149,10 +149,23 @@ def _sector(sector: Sector) -> Floats:
     return np.concatenate([outer, inner, outer[:1]])
 
 
+def rings(reach: float) -> tuple[list[float], list[str]]:
+    """Radii at every round number of metres up to `reach`, and their labels."""
+    step = _round(2 * reach)
+    unit, scale = ("km", 1e-3) if step >= 1000 else ("m", 1.0)
+    radii = [step * k for k in range(1, max(math.floor(reach / step), 1) + 1)]
+    return radii, [f"{radius * scale:g} {unit}" for radius in radii]
+
+
+def _round(size: float) -> float:
+    """The least of 1, 2, 5 times a power of ten, m, of which at most eight make `size`."""
+    step = 10.0 ** math.floor(math.log10(max(size, 1.0) / 4))
+    return step * next(f for f in (1, 2, 5, 10) if size / (f * step) <= 8)
+
+
 def grid(low: Floats, high: Floats) -> tuple[list[Floats], list[str]]:
     """Lines every round number of metres over the square `low`..`high` (2,) of east and north, and their labels."""
-    step = 10 ** math.floor(math.log10(max(float(np.max(high - low)), 1.0) / 4))
-    step *= next(f for f in (1, 2, 5, 10) if np.max(high - low) / (f * step) <= 8)
+    step = _round(float(np.max(high - low)))
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step
     unit, scale = ("km", 1e-3) if step >= 1000 else ("m", 1.0)
     lines, labels = [], []

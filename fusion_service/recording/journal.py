@@ -1,22 +1,30 @@
 """What happened, as lines of text and a page of health.
 
 /log/{about}         one line per event: refusals, sources, tracks, service, recorder
+/log/track           with a `focus`: every decision on this track
 /health/{centre}     the newest status as a page
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from datetime import UTC, datetime
 from typing import Any
+
+import numpy as np
 
 from fusion_service.recording.columns import Columns, Stamp, documents, entity, texts
 from fusion_service.recording.drawing import Drawing
 from schemas import GlobalTracks, Status, StepLog
+from schemas.messages import DECISIONS, KEPT, NO_SOURCE
 
 __all__ = ["Journal"]
 
 INFO, WARN = "INFO", "WARN"
+WAITING = 1000
+"""Lines that wait for a mission time; the oldest are dropped."""
+KNOWN = 4096
+"""Sources and services whose run is remembered, the newest."""
 SAID_ELSEWHERE = ("found", "lost", "restarted")
 """Events of a service that its status, or the epoch of the messages, shows as well."""
 
@@ -24,12 +32,13 @@ SAID_ELSEWHERE = ("found", "lost", "restarted")
 class Journal:
     """Turns messages into lines; repeats of one fault within a message become one line with a number."""
 
-    def __init__(self, columns: Columns, drawing: Drawing) -> None:
+    def __init__(self, columns: Columns, drawing: Drawing, focus: int | None = None) -> None:
         self._columns = columns
+        self._focus = focus
         self._label = drawing.label
         self._epochs: dict[tuple[str, str], int] = {}
-        self._health: dict[tuple[str, str], str] = {}
-        self._waiting: list[tuple[str, str, str, int]] = []
+        self._health: dict[str, dict[str, str]] = {}
+        self._waiting: deque[tuple[str, str, str, int]] = deque(maxlen=WAITING)
 
     def say(self, about: str, level: str, text: str, stamp: Stamp) -> None:
         """One line. What has no mission time waits for the next that has."""
@@ -52,6 +61,8 @@ class Journal:
         if before == epoch:
             return False
         self._epochs[kind, name] = epoch
+        if len(self._epochs) > KNOWN:
+            del self._epochs[next(iter(self._epochs))]
         verb = "appears" if before is None else "has been started again"
         self.say(f"{kind}s", INFO if before is None else WARN, f"{kind} {name} {verb} (epoch {_utc(epoch)})", stamp)
         return True
@@ -64,16 +75,16 @@ class Journal:
     def status(self, message: Status, stamp: Stamp) -> list[str]:
         """A line per source whose health changed, and the page. Returns the sources that were just lost."""
         lost = []
-        for name, said in message.sources.items():
-            state = _state(said)
-            before = self._health.get((message.source, name))
-            self._health[message.source, name] = state
+        known = self._health.get(message.source, {})
+        states = self._health[message.source] = {name: _state(said) for name, said in message.sources.items()}
+        for name, state in states.items():
+            before = known.get(name)
             if before is not None and before != state:
                 self.say("sources", INFO if state == "alive" else WARN, f"source {name}: {before} -> {state}", stamp)
             if state == "lost" and before != state:
                 lost.append(name)
         if stamp.time is not None:
-            self._columns.add(entity("health", message.source), documents, stamp, _page(message))
+            self._columns.add(entity("health", message.source), documents, stamp, _page(message), stands=True)
         return lost
 
     def step(self, message: StepLog, stamp: Stamp) -> None:
@@ -90,6 +101,22 @@ class Journal:
                 continue
             rest = ", ".join(f"{key} {_short(value)}" for key, value in event.items() if key not in ("kind", "epoch"))
             self.say("services", INFO, f"service {message.source}: {kind}{f' ({rest})' if rest else ''}", stamp)
+        if self._focus is not None:
+            self._decisions(message, self._focus, stamp)
+
+    def _decisions(self, message: StepLog, track: int, stamp: Stamp) -> None:
+        """All on `track` but that its links are kept."""
+        made = message.decisions
+        for row in np.flatnonzero(((made.track == track) | (made.other == track)) & (made.kind != KEPT)).tolist():
+            text = DECISIONS[int(made.kind[row])].replace("_", " ")
+            source = int(made.source[row])
+            if source != NO_SOURCE and source < len(message.sources):
+                text += f" {message.sources[source]} track {int(made.id[row])}"
+            if other := int(made.other[row]):
+                text += f", other track {self._label(int(made.track[row]) if other == track else other)}"
+            if np.isfinite(value := float(made.value[row])):
+                text += f" ({value:.3g})"
+            self.say("track", INFO, f"{message.source}: {text}", stamp)
 
     def tracks(self, message: GlobalTracks, stamp: Stamp) -> None:
         """Ended, merged and split global tracks."""

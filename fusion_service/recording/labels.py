@@ -9,6 +9,8 @@ from schemas import GlobalTracks
 __all__ = ["Labels"]
 
 COUNTERS = 1 << 32
+MAX_GENERATIONS = 1000
+"""Runs of services that are numbered; those beyond are called by their generation."""
 
 
 class Labels:
@@ -20,6 +22,8 @@ class Labels:
 
     def __call__(self, track: int) -> str:
         generation, counter = divmod(int(track), COUNTERS)
+        if generation not in self._generations and len(self._generations) >= MAX_GENERATIONS:
+            return f"{generation}.{counter}"
         number = self._generations.setdefault(generation, len(self._generations) + 1)
         return f"{number}.{counter}" if number > 1 else str(counter)
 

@@ -5,11 +5,25 @@ from __future__ import annotations
 import colorsys
 from collections.abc import Iterable
 
-__all__ = ["FUSED", "GRID", "NEUTRAL", "TRUTH", "WARNING", "Colour", "packed", "series_colour", "source_colours"]
+__all__ = [
+    "CENTRES",
+    "FUSED",
+    "GRID",
+    "NEUTRAL",
+    "TRUTH",
+    "WARNING",
+    "Colour",
+    "centre_colours",
+    "packed",
+    "series_colour",
+    "shade",
+    "source_colours",
+]
 
 Colour = tuple[int, int, int]
 
 FUSED: Colour = (255, 62, 62)
+CENTRES: tuple[Colour, ...] = (FUSED, (190, 255, 70), (255, 90, 235), (170, 135, 255))
 TRUTH: Colour = (150, 150, 150)
 NEUTRAL: Colour = (205, 205, 205)
 GRID: Colour = (58, 58, 58)
@@ -21,6 +35,17 @@ def source_colours(names: Iterable[str]) -> dict[str, Colour]:
     from fusion_service import picture  # which imports this package
 
     return {name: _rgb(text) for name, text in picture.source_colours(names).items()}
+
+
+def centre_colours(names: Iterable[str]) -> dict[str, Colour]:
+    """The colour of each centre, by alphabetical order: a single one's is `FUSED`."""
+    return {name: CENTRES[index % len(CENTRES)] for index, name in enumerate(sorted(set(names)))}
+
+
+def shade(colour: Colour, share: float) -> Colour:
+    """`colour` with so much of its light."""
+    red, green, blue = (round(share * part) for part in colour)
+    return red, green, blue
 
 
 def _rgb(text: str) -> Colour:

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fusion_service.inbox import Inbox
+from fusion_service.recording.parts import Rotation
 from fusion_service.recording.recorder import Recorder
 from schemas import REALM, Frame
 
 if TYPE_CHECKING:
     from fusion_service.bus import Bus
+    from fusion_service.recording.live import Live
 
 __all__ = ["default_path", "run_recorder"]
 
@@ -31,13 +33,13 @@ Item = tuple[str, bytes | bool | int, int]
 """Key; bytes of a message, whether a token is there, or how many messages are lost; receive time, ns."""
 
 
-def default_path(folder: str | Path = "runs") -> Path:
-    """`mission-<UTC time>.rrd` in `folder`, numbered where that exists."""
+def default_path(folder: str | Path = "runs", suffix: str = ".rrd") -> Path:
+    """`mission-<UTC time>.rrd` in `folder`, numbered where that exists. suffix: empty for a folder of parts."""
     stem = datetime.now(UTC).strftime("mission-%Y%m%dT%H%M%SZ")
-    path = Path(folder) / f"{stem}.rrd"
+    path = Path(folder) / f"{stem}{suffix}"
     number = 2
     while path.exists():
-        path = Path(folder) / f"{stem}-{number}.rrd"
+        path = Path(folder) / f"{stem}-{number}{suffix}"
         number += 1
     return path
 
@@ -52,10 +54,13 @@ def run_recorder(
     cutoff: float | None = None,
     trail: float = 300.0,
     draw: bool = True,
+    rotation: Rotation | None = None,
+    live: Live | None = None,
     interval: float = 1.0,
     on_tick: Callable[[Recorder], None] | None = None,
 ) -> Recorder:
-    """Record all that crosses `bus` under `realm` until `stop` is set, and close the file. Returns the recorder.
+    """Record all that crosses `bus` under `realm` until `stop` is set, and close the file, and `live`. Returns the
+    recorder.
 
     path: None for `default_path()`. interval: seconds between ticks; a recorder that is killed loses at most what
     came since the last. on_tick: called after each. The rest, and what is raised, as in `Recorder`; the file is made
@@ -71,8 +76,10 @@ def run_recorder(
         bus.subscribe(f"{realm}/v1/**", put, on_miss=put),
     ]
     try:
-        path = path or default_path()
-        with Recorder(path, realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw) as recorder:
+        path = path or default_path(suffix=".rrd" if rotation is None else "")
+        with Recorder(
+            path, realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw, rotation=rotation, live=live
+        ) as recorder:
             log.info("recording %s/v1/** into %s", realm, path)
             _loop(inbox, recorder, stop, interval, on_tick or (lambda recorder: None))
             for declaration in declared:
@@ -81,6 +88,8 @@ def run_recorder(
     finally:
         for declaration in declared:
             declaration.close()
+        if live is not None:
+            live.close()
     log.info("%s: %d messages, %d rows", path, recorder.messages, recorder.rows)
     return recorder
 

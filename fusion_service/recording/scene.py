@@ -39,8 +39,14 @@ PATIENCE = 5.0
 AHEAD = 3600 * 10**9
 """Nanoseconds by which a message may be ahead of the newest global one and still be on the mission's timeline."""
 MAX_SOURCES = 256
+MAX_CENTRES = 32
 MAX_TRACKS = 5000
-"""Sources, and tracks of one message, that are drawn; an ellipse takes 600 B. `tables` bounds the components."""
+"""Sources, centres and scenarios, and tracks of one message, that are drawn; an ellipse takes 600 B. `tables` bounds
+the components."""
+MAX_WAITING = 10_000
+"""Messages that wait for a frame or a mission time."""
+MAX_REASONS = 100
+"""Reasons that are told apart in `undrawn`; what is beyond them is "other"."""
 MAX_ASSESSED = 1000
 """Tracks and true objects of a step that are assigned to each other."""
 
@@ -50,17 +56,25 @@ Drawable = LocalTracks | LocalIntensity | GlobalTracks | SensorInfo | Truth
 class Scene:
     """What a recording shows, written as rows of `columns`. `undrawn`: tracks or messages left out, by reason."""
 
-    def __init__(self, columns: Columns, frame: Frame | None, cutoff: float | None) -> None:
-        self.drawing = Drawing(columns, frame)
-        self.journal = Journal(columns, self.drawing)
+    def __init__(self, columns: Columns, frame: Frame | None, cutoff: float | None, focus: int | None = None) -> None:
+        self.drawing = Drawing(columns, frame, focus)
+        self.journal = Journal(columns, self.drawing, focus)
+        self.crowded = False
+        """Whether charts have so many series that a legend would hide them."""
         self.now: int | None = None
         self._start: int | None = None
         self.undrawn: Counter[str] = Counter()
-        self._charts = Charts(columns)
+        self._charts = Charts(columns, focus)
         self._assessment = Assessment(cutoff)
         self._by_centre = False
         self._new: list[tuple[Message, Stamp]] = []
         self._said: set[tuple[str, str]] = set()
+        self._names: dict[bool, set[str]] = {True: set(), False: set()}
+
+    def restart(self) -> None:
+        """A new part of the recording begins."""
+        self._charts.restart()
+        self.drawing.changed = True
 
     def mission_time(self, message: Message | None) -> int | None:
         """The time of `message` on the mission's timeline, None where it has none or is impossibly far ahead. That of
@@ -83,6 +97,9 @@ class Scene:
             self._leave_out(message.source, "its time is far ahead", 1, stamp._replace(time=self.now))
         else:
             self._new.append((message, stamp if stamp.time is not None else stamp._replace(time=self.now)))
+        if len(self._new) > MAX_WAITING and self.drawing.chart is None:
+            self._new.pop(0)
+            self._leave_out(message.source, "nothing has said a frame and a time yet", 1, stamp)
 
     def alive(self, scope: str, name: str, alive: bool, stamp: Stamp) -> None:
         """A liveliness token came or went."""
@@ -110,8 +127,12 @@ class Scene:
         if drawn:
             with self._guard("truth", drawn[-1][1]._replace(time=self.now)):
                 for score in self._assessment.scores():
-                    self._charts.score(score)
+                    over = self._charts.score(score, self.drawing.centres)
+                    if over:
+                        self._leave_out(score.centre, "too many targets", over, score.stamp)
         self.drawing.colour_sources()
+        if self.crowded != self._charts.crowded:
+            self.crowded = self.drawing.changed = True
 
     def _open_chart(self, patience: float) -> bool:
         """Whether the frame of the drawing, and a mission time, are known; takes the frame if it is time to."""
@@ -127,6 +148,11 @@ class Scene:
 
     def _unfit(self, message: Message) -> str:
         """Why a message as a whole is not drawn; empty if it is."""
+        if isinstance(message, GlobalTracks | Status | StepLog | Truth):
+            known = self._names[isinstance(message, Truth)]
+            if message.source not in known and len(known) >= MAX_CENTRES:
+                return f"more than {MAX_CENTRES} {'scenarios' if isinstance(message, Truth) else 'centres'}"
+            known.add(message.source)
         if isinstance(message, LocalTracks | GlobalTracks | Truth) and len(message.ids) > MAX_TRACKS:
             return f"more than {MAX_TRACKS} tracks"
         new = isinstance(message, LocalTracks | LocalIntensity | SensorInfo)
@@ -157,8 +183,7 @@ class Scene:
                 self._assessment.step(message, stamp)
             if drawing.chart is not None:
                 self._too_many(message, "components", drawing.global_tracks(message, sound, stamp), stamp)
-            charts.step(message, drawing.colours, stamp)
-            unseen = charts.existence(message, drawing.label, stamp)
+            unseen = charts.step(message, drawing.colours, drawing.centres, drawing.label, stamp)
             self._too_many(message, "series of existence", unseen, stamp)
         else:
             if isinstance(message, LocalTracks):
@@ -191,6 +216,8 @@ class Scene:
 
     def _leave_out(self, source: str, reason: str, count: int, stamp: Stamp) -> None:
         """Count, and say so the first time for each source and reason."""
+        if reason not in self.undrawn and len(self.undrawn) >= MAX_REASONS:
+            reason = "other"
         self.undrawn[reason] += count
         if (source, reason) not in self._said and len(self._said) < MAX_SOURCES:
             self._said.add((source, reason))

@@ -1,0 +1,26 @@
+"""`fusion-service repair`."""
+
+from __future__ import annotations
+
+import argparse
+import threading
+from pathlib import Path
+
+HELP = "Make the torn recording of a recorder that was killed whole, in place."
+EXAMPLE = "fusion-service repair mission.rrd\n  fusion-service repair mission/         every part of a mission"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recording", metavar="PATH", help="recording (.rrd), or a folder of parts")
+
+
+def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.errors import ReviewError
+    from fusion_service.recording.repair import mend_all
+
+    failed = 0
+    for path, done in mend_all(Path(args.recording), stop.is_set):
+        failed += isinstance(done, ReviewError)
+        print(f"{done}" if isinstance(done, ReviewError) else f"{path}: {done}", flush=True)
+    if failed:
+        raise ReviewError(f"{failed} of what is there could not be made whole: move it away")

@@ -1,0 +1,36 @@
+"""Sizes and durations as people write them: 500MB, 20 GB, 90s, 1h, 7d."""
+
+from __future__ import annotations
+
+import math
+import re
+
+__all__ = ["duration", "size"]
+
+SIZES = {"b": 1, "": 1} | {
+    f"{prefix}{suffix}": base**power
+    for suffix, base in (("b", 1000), ("", 1000), ("ib", 1024))
+    for power, prefix in enumerate("kmgt", start=1)
+}
+SECONDS = {"s": 1.0, "": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0, "d": 86400.0, "w": 604800.0}
+TEXT = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)", re.ASCII)
+
+
+def size(text: str) -> int:
+    """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500` 500 bytes. `ValueError` in one line."""
+    value = _value(text, SIZES, "a size: give a number and B, kB, MB, GB, TB or KiB, MiB, GiB, as in 500MB")
+    return math.ceil(value)
+
+
+def duration(text: str) -> float:
+    """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. `ValueError` in one line."""
+    return _value(text, SECONDS, "a duration: give a number and s, min, h, d or w, as in 1h")
+
+
+def _value(text: str, units: dict[str, float] | dict[str, int], what: str) -> float:
+    match = TEXT.fullmatch(text.strip().lower())
+    factor = units.get(match[2]) if match else None
+    value = float(match[1]) * factor if match and factor else 0.0
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"{text!r} is not {what}")
+    return value
