@@ -7,10 +7,12 @@ direction. The mean NEES does not show it: it averages over directions.
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
+from studies.consistency import consistency, draw, moments
 from studies.rules import fuser
-from studies.statistics import jackknife
 from studies.study import Floats, Result, Row, Run, Study
 
 RULES = ("naive", "ei", "ici", "hmd-ga:weights=uniform", "hmd-ga", "ci")
@@ -34,27 +36,17 @@ def errors(rng: np.random.Generator, runs: int) -> tuple[Floats, Floats]:
     return e.reshape(2, 2, runs), np.ascontiguousarray(covariances)
 
 
-def excess(samples: Floats) -> float:
-    """Largest eigenvalue of MSE relative to the mean reported covariance: samples (n + n^2, M), errors and P."""
-    n = 2
-    e, P = samples[:n], samples[n:].reshape(n, n, -1).mean(axis=-1)
-    mse = e @ e.T / e.shape[1]
-    C = np.linalg.inv(np.linalg.cholesky(P))
-    return float(np.linalg.eigvalsh(C @ mse @ C.T)[-1])
-
-
 def run(run: Run) -> Result:
     e, P = errors(run.rng(), run.runs)
-    rows = []
+    rows, shown = [], {}
     for rule in (*map(fuser, RULES), *run.rules):
         fused = rule(e, P)
-        samples = np.concatenate([fused.mean, fused.covariance.reshape(4, -1)])
-        value = jackknife(excess, samples)
-        rows.append(
-            Row(rule.label, "largest eigenvalue of MSE / reported", INDEPENDENT.get(rule.label), *value, decimals=2)
-        )
+        one = shown[rule.label] = consistency(moments(fused.mean, fused.covariance))
+        published = INDEPENDENT.get(rule.label)
+        rows.append(Row(rule.label, "largest eigenvalue of MSE / reported", published, *one.excess, decimals=2))
     notes = ("The published column is that of the independent derivation that found the counter-example.",)
-    return Result(tuple(rows), notes)
+    title = "Reported (solid) and true (dashed) covariance, 86.5 %; grey: the naive rule's true one; red: too sure"
+    return Result(tuple(rows), notes, partial(draw, shown=shown, title=title, columns=3), (9.0, 6.8))
 
 
 STUDIES = (

