@@ -12,67 +12,47 @@
   its sources declare.
 * RMSE, NEES and identity switches are over the pairs that GOSPA (p = 2, alpha = 2) assigns: errors below c. The
   bounds of the ANEES suppose independent errors; those along one track are not, so the true bounds are wider.
+* Time to confirm: from when a target exists where a source says it covers (by its newest info), or has a local track,
+  to the first fused track assigned to it, between scored times.
+* Where there is no truth, what needs none is told (`consistency`, `logbook`), at the times of the centres' pictures.
+
+Messages are read in blocks of times: what is held is what was last said, and the results.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from fusion_service.geodesy import FrameError
-from fusion_service.metrics import gospa, identity_switches, nees, nees_bounds
-from fusion_service.snapshots import (
-    Snapshot,
-    centre_snapshots,
-    interval,
-    source_snapshots,
-    truth_path,
-    truth_positions,
-)
-from schemas import Frame, GlobalTracks, LocalTracks, Message, Motion, SensorInfo, Truth
+from fusion_service.consistency import Agreement, Consistency
+from fusion_service.coverage import covers
+from fusion_service.errors import ReviewError
+from fusion_service.logbook import Logbook
+from fusion_service.metrics import DENSE
+from fusion_service.scoring import METRICS, Scores, Tally, averages, bounds, plain
+from fusion_service.snapshots import STALE_PERIODS, STALE_STEPS, Block, Follower, truth_path, truth_positions
+from fusion_service.tables import format_table
+from schemas import Frame, GlobalTracks, LocalTracks, Message, Motion, Truth
 
-__all__ = ["METRICS", "Evaluation", "Scores", "evaluate", "format_table"]
+__all__ = ["METRICS", "Assessment", "Evaluation", "NothingToScoreError", "Scores", "assess", "evaluate", "format_table"]
 
 Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+Tracks = LocalTracks | GlobalTracks
 
-METRICS = (
-    "gospa",
-    "gospa_localisation",
-    "gospa_missed",
-    "gospa_false",
-    "rmse_position",
-    "anees",
-    "identity_switches",
-)
+BLOCK = 32
+"""Times scored at once."""
+SPREADS = 20.0
+"""Without a given cut-off: so many standard deviations of the fused position, rounded up to 1, 2 or 5 times 10^n."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Scores:
-    """One source, or the fused tracks, over K scored times and T targets.
-
-    gospa: mean distance, m; gospa_localisation, _missed, _false: mean squares, m2. rmse_position, m, and anees, the
-    mean NEES of position over its dimension (1 is ideal), are NaN without a pair. bounds: 95 % for the anees of
-    so many pairs. errors (K, T), m, and nees (K, T), over the dimension: NaN where no track was assigned.
-    """
-
-    gospa: float
-    gospa_localisation: float
-    gospa_missed: float
-    gospa_false: float
-    rmse_position: float
-    anees: float
-    identity_switches: int
-    bounds: tuple[float, float]
-    errors: Floats
-    nees: Floats
-
-    def as_json(self) -> dict[str, float | int | None]:
-        """The seven numbers of `METRICS`, None for what does not exist."""
-        return {name: _plain(getattr(self, name)) for name in METRICS}
+class NothingToScoreError(ReviewError):
+    """There is nothing to score, or not what was asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +60,8 @@ class Evaluation:
     """The scores of each source and of the centre.
 
     times (K,) ns; targets: T truth ids; exists (K, T); seen (K, T): how many sources had a track assigned to the
-    target; left_out: source -> why it could not be scored.
+    target; left_out: source -> why it could not be scored. begins, confirm (T,): when each target could first be
+    known, an index into times, -1 for never, and the seconds from there to its first fused track, NaN without one.
 
     shared: "seen_by_2", ..., "seen_by_2_or_more" -> over the pairs (target, time) on which so many sources had an
     assigned track: pairs, fused_missed (those without a fused track, which are in none of the other numbers), RMSE
@@ -99,6 +80,8 @@ class Evaluation:
     seen: NDArray[np.int64]
     shared: dict[str, dict[str, Any]]
     left_out: dict[str, str]
+    begins: NDArray[np.int64]
+    confirm: Floats
 
     def as_json(self, scenario: str, rule: str, recording: str) -> dict[str, Any]:
         """The summary as plain values, ready for `json.dumps`."""
@@ -108,10 +91,10 @@ class Evaluation:
             "recording": recording,
             "sources": {name: scores.as_json() for name, scores in self.sources.items()},
             "fused": self.fused.as_json(),
-            "shared": {name: {key: _plain(value) for key, value in row.items()} for name, row in self.shared.items()},
+            "shared": {name: {key: plain(value) for key, value in row.items()} for name, row in self.shared.items()},
             "nees_bounds": {
-                "sources": {name: _plain(scores.bounds) for name, scores in self.sources.items()},
-                "fused": _plain(self.fused.bounds),
+                "sources": {name: plain(scores.bounds) for name, scores in self.sources.items()},
+                "fused": plain(self.fused.bounds),
             },
             "scored": {
                 "c": self.c,
@@ -123,6 +106,32 @@ class Evaluation:
                 "left_out": self.left_out,
             },
         }
+
+    def more_json(self) -> dict[str, Any]:
+        """All other numbers, and the series over time."""
+        confirm = [plain(one) for one in self.confirm.tolist()]
+        return {
+            "centre": self.centre,
+            "times_ns": self.times.tolist(),
+            "true": self.exists.sum(axis=1).tolist(),
+            "time_to_confirm": dict(zip(map(str, self.targets), confirm, strict=True)),
+            "sources": {name: scores.more_json() for name, scores in self.sources.items()},
+            "fused": self.fused.more_json(),
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Assessment:
+    """A mission as it is told: its logbook; evaluations by centre, none without truth (why: `unscored`); agreements
+    of sources by centre; the cut-off, m, and whether it was chosen here; a thinned mission, for a map."""
+
+    book: Logbook
+    evaluations: dict[str, Evaluation]
+    agreements: dict[str, Agreement]
+    unscored: str | None
+    c: float
+    chosen: bool
+    sample: list[Message]
 
 
 def evaluate(
@@ -142,131 +151,285 @@ def evaluate(
     frame, space: to score in, by default those of the centre's first picture. centre: which one, if several.
     motion: of sources that never published a SensorInfo (default: cv, q = 1 m2/s3); their period is their median
     interval. A source whose frame has no relation to the scoring one, or that lacks z where it is scored, is left out,
-    by name. Raises ValueError where nothing can be scored.
+    by name. Raises `NothingToScoreError`, a ValueError, where nothing can be scored.
     """
     if not c > 0 or not (every is None or every > 0):
         raise ValueError(f"c and every must be positive: {c}, {every}")
-    local: dict[str, list[LocalTracks]] = {}
-    fused: dict[str, list[GlobalTracks]] = {}
-    infos: dict[str, SensorInfo] = {}
-    truths: list[Truth] = []
-    for message in messages:
-        if isinstance(message, LocalTracks):
-            local.setdefault(message.source, []).append(message)
-        elif isinstance(message, GlobalTracks):
-            fused.setdefault(message.source, []).append(message)
-        elif isinstance(message, Truth):
-            truths.append(message)
-        elif isinstance(message, SensorInfo):
-            known = infos.get(message.source, message)
-            infos[message.source] = max(known, message, key=lambda info: (info.epoch, info.seq))
+    book = Logbook(messages)
+    if centre is None and len(book.centres) > 1:
+        raise NothingToScoreError(f"tracks of several centres ({', '.join(book.centres)}): say which one to score")
+    centres = [centre] if centre else book.centres
+    ground = _ground(book, centres, frame, space, motion, c)
+    scored = _truth(book.truths, ground, book.times(centres) if centres else None, every, gap)
+    found, _, _ = _walk(book, ground, scored, scored.times)
+    return found[centres[0] if centres else ""]
 
-    if centre is None and len(fused) > 1:
-        raise ValueError(f"tracks of several centres ({', '.join(sorted(fused))}): say which one to score")
-    if centre is not None and centre not in fused:
-        raise ValueError(f"no tracks of a centre {centre!r} (there are: {', '.join(sorted(fused)) or 'none'})")
-    centre = centre or next(iter(fused), None)
-    pictures = fused[centre] if centre else []
-    if pictures:
-        first = min(pictures, key=lambda picture: (picture.time, picture.epoch))
-        frame, space = frame or first.frame, space or first.space
-    if frame is None or space is None or (every is None and not pictures):
-        raise ValueError("no global tracks: without a centre, frame, space and every must be given")
 
-    axes = tuple(name for name in "xyz" if name in space)
-    paths = truth_path(truths, frame, axes)
-    if not paths:
-        raise ValueError("no truth to score against")
-    times = _scored_times(paths, pictures, every)
-    positions = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
-    sources: dict[str, Scores] = {}
-    left_out: dict[str, str] = {}
-    for name, scans in sorted(local.items()):
-        info = infos.get(name)
-        period, moves = (info.period, info.motion) if info else (interval(scans), motion or Motion("cv", 1.0))
-        try:
-            sources[name] = _score(positions, source_snapshots(scans, times, period, moves, frame, axes), c)
-        except FrameError as error:
-            left_out[name] = str(error)
-    drift = Motion("cv", max((infos[name].motion.q for name in infos if name in sources), default=1.0))
-    scores = _score(positions, centre_snapshots(pictures, times, drift, frame, axes), c)
-
-    exists = np.isfinite(positions[..., 0])
-    seen = np.zeros(exists.shape, dtype=np.int64)
-    for one in sources.values():
-        seen += np.isfinite(one.errors)
-    return Evaluation(
-        c=c,
-        dimension=len(axes),
-        times=times,
-        targets=tuple(paths),
-        exists=exists,
-        centre=centre,
-        sources=sources,
-        fused=scores,
-        seen=seen,
-        shared=_shared(list(sources.values()), scores, seen, len(axes)),
-        left_out=left_out,
+def assess(
+    book: Logbook,
+    *,
+    c: float | None = None,
+    every: float | None = None,
+    centres: Sequence[str] = (),
+    truths: Sequence[Truth] = (),
+    gap: float = 5.0,
+    motion: Motion | None = None,
+    progress: Callable[[float], None] = lambda _: None,
+    rows: int = 0,
+) -> Assessment:
+    """Everything that can be said of a mission. centres: which ones, all by default, each scored at the times of the
+    pictures of all. truths: in place of the mission's own. progress: called with the share that is done. rows: about
+    how many tracks of each source `sample` is to hold. Raises `NothingToScoreError` where there are no tracks."""
+    chosen = c is None
+    names = list(centres) or book.centres
+    ground = _ground(book, names, None, None, motion, c or book.cutoff(SPREADS))
+    at = book.times(names) if names else None
+    try:
+        scored, unscored = _truth(truths or book.truths, ground, at, every, gap), None
+    except ValueError as error:
+        scored, unscored = None, str(error)
+    times = scored.times if scored else _all_times(book, at, every)
+    found, agreements, sample = _walk(book, ground, scored, times, progress, rows)
+    return Assessment(
+        book=book,
+        evaluations=found,
+        agreements=agreements,
+        unscored=unscored,
+        c=ground.c,
+        chosen=chosen,
+        sample=sample,
     )
 
 
-def _scored_times(
-    paths: dict[int, tuple[NDArray[np.int64], Floats]], pictures: Sequence[GlobalTracks], every: float | None
-) -> NDArray[np.int64]:
+class _Ground(NamedTuple):
+    """What all are scored on. sources: those that can be; motions, limits (s): of each of them and of each centre."""
+
+    frame: Frame
+    axes: tuple[str, ...]
+    speeds: tuple[str, ...]
+    sources: list[str]
+    centres: list[str]
+    left_out: dict[str, str]
+    motions: dict[tuple[str, str], Motion]
+    limits: dict[tuple[str, str], float]
+    c: float
+
+
+class _Truth(NamedTuple):
+    """times (K,), ids of T targets, their states (K, T, m)."""
+
+    times: Times
+    targets: tuple[int, ...]
+    states: Floats
+
+
+def _ground(
+    book: Logbook,
+    centres: Sequence[str],
+    frame: Frame | None,
+    space: tuple[str, ...] | None,
+    motion: Motion | None,
+    c: float,
+) -> _Ground:
+    for name in centres:
+        if name not in book.centres:
+            there = ", ".join(book.centres) or "none"
+            raise NothingToScoreError(f"no tracks of a centre {name!r} (there are: {there})")
+    if centres:
+        first = book.first_pictures[centres[0]]
+        frame, space = frame or first.frame, space or first.space
+    if frame is None or space is None:
+        raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
+    axes = tuple(name for name in "xyz" if name in space)
+    left_out = {name: reason for name in book.sources if (reason := book.unreachable(name, frame, axes))}
+    sources = [name for name in book.sources if name not in left_out]
+    motions: dict[tuple[str, str], Motion] = {}
+    limits: dict[tuple[str, str], float] = {}
+    for name in sources:
+        info = book.infos.get(name)
+        period = info.period if info else book.traffic["local", name].interval
+        motions["local", name] = info.motion if info else motion or Motion("cv", 1.0)
+        limits["local", name] = STALE_PERIODS * period
+    drift = Motion("cv", max((book.infos[name].motion.q for name in sources if name in book.infos), default=1.0))
+    for name in centres:
+        motions["global", name] = drift
+        limits["global", name] = STALE_STEPS * book.traffic["global", name].interval
+    speeds = tuple(f"v{name}" for name in axes)
+    return _Ground(frame, axes, speeds, sources, list(centres), left_out, motions, limits, c)
+
+
+def _truth(truths: Sequence[Truth], ground: _Ground, pictures: Times | None, every: float | None, gap: float) -> _Truth:
+    """ValueError where there is none."""
+    if every is None and pictures is None:
+        raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
+    paths = truth_path(truths, ground.frame, ground.axes, ground.speeds)
+    if not paths:
+        raise NothingToScoreError("no truth to score against")
     first, last = min(int(known[0]) for known, _ in paths.values()), max(int(known[-1]) for known, _ in paths.values())
     if every is None:
-        times = np.unique(np.array([picture.time for picture in pictures], dtype=np.int64))
-        times = times[(times >= first) & (times <= last)]
+        assert pictures is not None
+        times = pictures[(pictures >= first) & (pictures <= last)]
     else:
-        step = round(every * 1e9)
-        times = np.arange(-(-first // step), last // step + 1, dtype=np.int64) * step
+        times = _multiples(first, last, every)
     if not len(times):
-        raise ValueError("no time to score: no picture of the centre, or no multiple of every, while there is truth")
-    return times
+        raise NothingToScoreError(
+            "no time to score: no picture of the centre, or no multiple of every, while there is truth"
+        )
+    states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
+    return _Truth(times, tuple(paths), states)
 
 
-def _score(positions: Floats, snapshots: list[Snapshot], c: float) -> Scores:
-    """positions (K, T, d), NaN where a target does not exist."""
-    count, targets, d = positions.shape
-    parts = np.zeros((count, 4))
-    assignments: list[dict[int, tuple[int, int]]] = []
-    errors, squared = np.full((2, count, targets), np.nan)
-    offsets, spreads = [np.empty((0, d))], [np.empty((0, d, d))]
-    for k, (truth, shown) in enumerate(zip(positions, snapshots, strict=True)):
-        there = np.flatnonzero(np.isfinite(truth[:, 0]))
-        result = gospa(truth[there], shown.positions, c)
-        parts[k] = result[:4]
-        rows, columns = there[result.assignment >= 0], result.assignment[result.assignment >= 0]
-        assignments.append({j: shown.keys[i] for j, i in zip(rows.tolist(), columns.tolist(), strict=True)})
-        errors[k, rows] = 0.0
-        offsets.append(shown.positions[columns] - truth[rows])
-        spreads.append(shown.covariances[columns])
-    pairs, offset = np.isfinite(errors), np.concatenate(offsets)
-    errors[pairs] = np.sqrt((offset * offset).sum(axis=1))
-    squared[pairs] = nees(offset, np.concatenate(spreads)) / d
-    distance, localisation, missed, false = (float(value) for value in parts.mean(axis=0))
-    rmse, anees = _averages(errors[pairs], squared[pairs])
-    return Scores(
-        gospa=distance,
-        gospa_localisation=localisation,
-        gospa_missed=missed,
-        gospa_false=false,
-        rmse_position=rmse,
-        anees=anees,
-        identity_switches=identity_switches(assignments),
-        bounds=_bounds(d, int(pairs.sum())),
-        errors=errors,
-        nees=squared,
-    )
+def _all_times(book: Logbook, pictures: Times | None, every: float | None) -> Times:
+    if every is None:
+        return pictures if pictures is not None else np.zeros(0, dtype=np.int64)
+    return _multiples(*book.span, every) if book.span else np.zeros(0, dtype=np.int64)
 
 
-def _averages(errors: Floats, squared: Floats) -> tuple[float, float]:
-    """RMSE and ANEES of pairs (R,), (R,); NaN without a pair."""
-    return (float(np.sqrt(np.mean(errors**2))), float(np.mean(squared))) if len(errors) else (np.nan, np.nan)
+def _multiples(first: int, last: int, every: float) -> Times:
+    step = max(round(every * 1e9), 1)
+    return np.arange(-(-first // step), last // step + 1, dtype=np.int64) * step
 
 
-def _bounds(d: int, pairs: int) -> tuple[float, float]:
-    return nees_bounds(d, pairs) if pairs else (np.nan, np.nan)
+def _walk(
+    book: Logbook,
+    ground: _Ground,
+    scored: _Truth | None,
+    times: Times,
+    progress: Callable[[float], None] = lambda _: None,
+    rows: int = 0,
+) -> tuple[dict[str, Evaluation], dict[str, Agreement], list[Message]]:
+    """Once through the tracks, block by block of `times`: evaluations and agreements by centre, a thinned mission."""
+    followers = {
+        key: Follower(ground.limits[key], ground.motions[key], ground.frame, ground.axes, ground.speeds)
+        for key in ground.motions
+    }
+    agreements = {name: Consistency(ground.sources, len(ground.axes)) for name in ground.centres}
+    score = _Score(book, ground, scored) if scored else None
+    thin = _Thin(book, ground, rows)
+    stream = book.tracks(lambda kind, name: (kind, name) in followers)
+    ahead = next(stream, None)
+    for begin in range(0, len(times), BLOCK):
+        block = times[begin : begin + BLOCK]
+        came: dict[tuple[str, str], list[Tracks]] = {key: [] for key in followers}
+        while ahead is not None and ahead.time <= block[-1]:
+            key = ("local" if isinstance(ahead, LocalTracks) else "global", ahead.source)
+            came[key].append(ahead)
+            thin.add(key, ahead)
+            ahead = next(stream, None)
+        for key, messages in came.items():
+            followers[key].take(messages)
+        shown = {key: follower.show(block) for key, follower in followers.items()}
+        if score:
+            score.add(
+                begin,
+                {key: one for key, (one, _) in shown.items()},
+                {key: pictures for key, (_, pictures) in shown.items() if key[0] == "global"},
+            )
+        local = {name: (followers["local", name].numbers, shown["local", name][0]) for name in ground.sources}
+        for name, agreement in agreements.items():
+            agreement.add(shown["global", name][1], local)
+        progress(min(1.0, (begin + BLOCK) / len(times)))
+    told = {name: agreement.result() for name, agreement in agreements.items()}
+    return score.evaluations() if score else {}, told, thin.sample
+
+
+class _Score:
+    """The scores of all, gathered block by block."""
+
+    def __init__(self, book: Logbook, ground: _Ground, truth: _Truth) -> None:
+        self._ground, self._truth, self._infos = ground, truth, book.infos
+        self._exists = np.isfinite(truth.states[:, :, 0])
+        count, targets = self._exists.shape
+        self._tallies = {key: Tally(truth.times, truth.states, len(ground.axes), ground.c) for key in ground.motions}
+        self._alone = None if ground.centres else Tally(truth.times, truth.states, len(ground.axes), ground.c)
+        self._seen = np.zeros((count, targets), dtype=np.int16)
+        self._begins = np.full(targets, -1)
+        self._confirmed = {name: np.full(targets, -1) for name in ground.centres}
+
+    def add(
+        self,
+        begin: int,
+        blocks: dict[tuple[str, str], Block],
+        pictures: dict[tuple[str, str], list[GlobalTracks | None]],
+    ) -> None:
+        d = len(self._ground.axes)
+        count = min(BLOCK, len(self._truth.times) - begin)
+        for row in range(count):
+            k = begin + row
+            there = np.flatnonzero(self._exists[k])
+            places = self._truth.states[k, there, :d]
+            tree = cKDTree(places) if len(there) ** 2 > DENSE else None
+            for key, tally in self._tallies.items():
+                tally.add(k, there, tree, blocks[key], row)
+                if key[0] == "local":
+                    self._seen[k] += tally.assigned(k)
+            if self._alone:
+                self._alone.add(k, there, tree, _nothing(d + len(self._ground.speeds), d), 0)
+            self._note_first(k, there, places)
+            for key, shown in pictures.items():
+                picture = shown[row]
+                if picture is not None:
+                    self._tallies[key].expect(k, float(picture.existence.sum()))
+
+    def _note_first(self, k: int, there: NDArray[np.intp], places: Floats) -> None:
+        known = self._seen[k] > 0
+        unknown = there[(self._begins[there] < 0) & ~known[there]]
+        if len(unknown):
+            where = self._truth.states[k, unknown, : places.shape[1]].T
+            for name in self._ground.sources:
+                if (info := self._infos.get(name)) is not None:
+                    known[unknown] |= covers(info, where, self._ground.frame)
+        self._begins[(self._begins < 0) & known] = k
+        for name, confirmed in self._confirmed.items():
+            confirmed[(confirmed < 0) & self._tallies["global", name].assigned(k)] = k
+
+    def evaluations(self) -> dict[str, Evaluation]:
+        """By centre; without one, by an empty name."""
+        scores = {key: tally.scores() for key, tally in self._tallies.items()}
+        sources = {name: scores["local", name] for name in self._ground.sources}
+        seen, times = self._seen.astype(np.int64), self._truth.times
+        found: dict[str, Evaluation] = {}
+        for name in self._ground.centres or [""]:
+            confirmed = self._confirmed.get(name, np.full(len(self._begins), -1))
+            after = np.maximum(times[confirmed] - times[self._begins], 0) / 1e9
+            fused = scores["global", name] if name else self._alone.scores() if self._alone else None
+            assert fused is not None
+            found[name] = Evaluation(
+                c=self._ground.c,
+                dimension=len(self._ground.axes),
+                times=times,
+                targets=self._truth.targets,
+                exists=self._exists,
+                centre=name or None,
+                sources=sources,
+                fused=fused,
+                seen=seen,
+                shared=_shared(list(sources.values()), fused, seen, len(self._ground.axes)),
+                left_out=self._ground.left_out,
+                begins=self._begins,
+                confirm=np.where((confirmed >= 0) & (self._begins >= 0), after, np.nan),
+            )
+        return found
+
+
+def _nothing(m: int, d: int) -> Block:
+    return Block(np.zeros(2, dtype=np.intp), np.zeros(0, dtype=np.intp), np.zeros((0, m)), np.zeros((0, d, d)))
+
+
+class _Thin:
+    """Keeps every so many messages of each source and of the first centre, about `rows` tracks of each."""
+
+    def __init__(self, book: Logbook, ground: _Ground, rows: int) -> None:
+        self.sample: list[Message] = list(book.infos.values()) if rows else []
+        wanted = [("local", name) for name in ground.sources] + [("global", name) for name in ground.centres[:1]]
+        self._every = {key: max(1, -(-book.traffic[key].tracks // rows)) for key in wanted} if rows else {}
+        self._count = dict.fromkeys(wanted, 0)
+
+    def add(self, key: tuple[str, str], message: Tracks) -> None:
+        if key in self._every:
+            if self._count[key] % self._every[key] == 0:
+                self.sample.append(message)
+            self._count[key] += 1
 
 
 def _shared(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: int) -> dict[str, dict[str, Any]]:
@@ -285,8 +448,8 @@ def _shared(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: in
     shared: dict[str, dict[str, Any]] = {}
     for name, mask in classes.items():
         pairs = mask & both
-        fused_rmse, fused_anees = _averages(fused.errors[pairs], fused.nees[pairs])
-        best_rmse, best_anees = _averages(best[pairs], best_nees[pairs])
+        fused_rmse, fused_anees = averages(fused.errors[pairs], fused.nees[pairs])
+        best_rmse, best_anees = averages(best[pairs], best_nees[pairs])
         shared[name] = {
             "pairs": int(pairs.sum()),
             "fused_missed": int((mask & ~both).sum()),
@@ -294,53 +457,6 @@ def _shared(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: in
             "best_rmse": best_rmse,
             "fused_anees": fused_anees,
             "best_anees": best_anees,
-            "nees_bounds": _bounds(d, int(pairs.sum())),
+            "nees_bounds": bounds(d, int(pairs.sum())),
         }
     return shared
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, tuple):
-        return [_plain(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value
-
-
-def format_table(evaluation: Evaluation) -> str:
-    """A plain text table: each source and the fused tracks, then the targets that several sources see."""
-    fused = f"fused ({evaluation.centre})" if evaluation.centre else "fused (no centre)"
-    table = [["", "RMSE", "GOSPA", "localis.", "missed", "false", "ANEES", "95 % bounds", "id switches"]]
-    for name, one in [*evaluation.sources.items(), (fused, evaluation.fused)]:
-        parts = (one.rmse_position, one.gospa, one.gospa_localisation, one.gospa_missed, one.gospa_false)
-        numbers = [*map(_digits, parts), _fixed(one.anees), _fixed(*one.bounds), str(one.identity_switches)]
-        table.append([name, *numbers])
-    lines = [
-        f"Scored at {len(evaluation.times)} times against {len(evaluation.targets)} targets; GOSPA p = 2, alpha = 2, "
-        f"c = {evaluation.c:g} m",
-        "RMSE and GOSPA in m, its parts in m2; ANEES over its dimension, 1 is ideal",
-        *_aligned(table),
-        *(f"not scored: {name}: {reason}" for name, reason in evaluation.left_out.items()),
-    ]
-    table = [["", "pairs", "RMSE fused", "best single", "ANEES fused", "best single", "95 % bounds", "no fused track"]]
-    for name, row in evaluation.shared.items():
-        rmse = [_digits(row["fused_rmse"]), _digits(row["best_rmse"])]
-        anees = [_fixed(row["fused_anees"]), _fixed(row["best_anees"]), _fixed(*row["nees_bounds"])]
-        table.append([name.replace("_", " "), str(row["pairs"]), *rmse, *anees, str(row["fused_missed"])])
-    title = "Targets that several sources track: fused beside the best single source, on the same pairs (target, time)"
-    return "\n".join([*lines, "", title, *_aligned(table)] if evaluation.seen.max() > 1 else lines)
-
-
-def _digits(value: float) -> str:
-    """Four significant digits, no exponent."""
-    if not np.isfinite(value):
-        return "-"
-    return f"{value:.{max(0, 3 - int(np.floor(np.log10(abs(value)))))}f}" if value else "0"
-
-
-def _fixed(*values: float) -> str:
-    return " - ".join(f"{value:.2f}" for value in values) if np.isfinite(values).all() else "-"
-
-
-def _aligned(table: list[list[str]]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    rows = ([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])] for row in table)
-    return ["  ".join(row) for row in rows]
