@@ -190,6 +190,9 @@ def assess(
         scored, unscored = None, str(error)
     times = scored.times if scored else _all_times(book, at, every)
     found, agreements, sample = _walk(book, ground, scored, times, progress, rows)
+    if rows and scored:
+        told = sorted(truths or book.truths, key=lambda truth: truth.time)
+        sample += told[:: max(1, sum(len(truth.ids) for truth in told) // rows)]
     return Assessment(
         book=book,
         evaluations=found,
@@ -433,23 +436,14 @@ class _Thin:
 
 
 def _shared(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: int) -> dict[str, dict[str, Any]]:
-    both = (seen >= 2) & np.isfinite(fused.errors)
-    best, best_nees = np.full((2, *seen.shape), np.nan)
-    if sources:
-        errors, squared = np.stack([one.errors for one in sources]), np.stack([one.nees for one in sources])
-        saw = np.isfinite(errors)
-        for j in np.flatnonzero(both.any(axis=0)):
-            for group in np.unique(saw[:, both[:, j], j], axis=1).T:
-                rows = np.flatnonzero(both[:, j] & (saw[:, :, j] == group[:, None]).all(axis=0))
-                mean_square = np.where(group, np.mean(errors[:, rows, j] ** 2, axis=1), np.inf)
-                chosen = int(np.argmin(mean_square))
-                best[rows, j], best_nees[rows, j] = errors[chosen, rows, j], squared[chosen, rows, j]
     classes = {f"seen_by_{n}": seen == n for n in range(2, len(sources) + 1)} | {"seen_by_2_or_more": seen >= 2}
+    both = (seen >= 2) & np.isfinite(fused.errors)
+    best, best_nees = _best_single(sources, both)
     shared: dict[str, dict[str, Any]] = {}
     for name, mask in classes.items():
         pairs = mask & both
         fused_rmse, fused_anees = averages(fused.errors[pairs], fused.nees[pairs])
-        best_rmse, best_anees = averages(best[pairs], best_nees[pairs])
+        best_rmse, best_anees = averages(best[mask[both]], best_nees[mask[both]])
         shared[name] = {
             "pairs": int(pairs.sum()),
             "fused_missed": int((mask & ~both).sum()),
@@ -460,3 +454,21 @@ def _shared(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: in
             "nees_bounds": bounds(d, int(pairs.sum())),
         }
     return shared
+
+
+def _best_single(sources: list[Scores], both: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Error and NEES of the best single source on the pairs `both` (K, T), R of them: of those that saw the target
+    then, the one with the least mean square on all the pairs of this target that the same sources saw."""
+    _, group = np.nonzero(both)
+    for index, one in enumerate(sources):
+        group = 2 * group + np.isfinite(one.errors[both])
+        if index % 32 == 31:
+            group = np.unique(group, return_inverse=True)[1]
+    _, group = np.unique(group, return_inverse=True)
+    least, best, best_nees = np.full(len(group), np.inf), *np.full((2, len(group)), np.nan)
+    for one in sources:
+        errors = one.errors[both]
+        total = np.bincount(group, weights=np.nan_to_num(errors) ** 2)[group] if len(group) else errors
+        better = np.isfinite(errors) & (total < least)
+        least[better], best[better], best_nees[better] = total[better], errors[better], one.nees[both][better]
+    return best, best_nees

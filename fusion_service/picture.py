@@ -309,7 +309,7 @@ def _followed(mission: _Mission) -> list[int]:
 
     followers = {
         target: sum(any(follows(track, target) for track in tracks) for tracks in mission.local.values())
-        for target in mission.truth
+        for target in list(mission.truth)[:MAX_LABELS]
     }
     return sorted((target for target, count in followers.items() if count), key=lambda target: -followers[target])
 

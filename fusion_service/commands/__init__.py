@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from fusion_service.commands import export
+from fusion_service.commands import evaluate, export
 
 __all__ = ["COMMANDS"]
 
-COMMANDS: tuple[ModuleType, ...] = (export,)
+COMMANDS: tuple[ModuleType, ...] = (evaluate, export)
 """In the order of the help; a command is called as its module, with hyphens."""
