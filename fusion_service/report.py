@@ -31,6 +31,7 @@ from fusion_service.tables import (
 
 __all__ = ["need_matplotlib", "report"]
 
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 SHARED = ("", "pairs", "RMSE fused", "best single", "ANEES fused", "best single", "95 % bounds", "no fused track")
 
 
@@ -81,6 +82,14 @@ def _which(row: Row, rows: Sequence[Row]) -> str:
     return escape(f": {row.rule}, {row.centre}" + (f" of {row.recording}" if row.recording else ""))
 
 
+def _short(value: float) -> str:
+    """Large numbers with their power of ten."""
+    if not value >= 1e5:
+        return digits(value)
+    mantissa, power = f"{value:.2e}".split("e+")
+    return f"{mantissa}·10{str(int(power)).translate(RAISED)}"
+
+
 def _facts(one: Assessment) -> str:
     lines = "".join(f"<dt>{escape(name)}</dt><dd>{escape(value)}</dd>" for name, value in facts(one).items())
     return f'<dl class="facts">{lines}</dl>'
@@ -89,14 +98,15 @@ def _facts(one: Assessment) -> str:
 def _table(
     head: Sequence[str], lines: Iterable[Sequence[str]], marks: dict[tuple[int, int], str] | None = None, left: int = 1
 ) -> str:
-    """marks: (row, column) -> class of the cell; a row that begins with "fused" stands out."""
+    """marks: (row, column) -> class of the cell; a row that begins with "fused" stands out. The first `left` columns,
+    and one without a name, stand to the left."""
     marks = marks or {}
     parts = ["<tr>", *(f"<th{_left(k, left)}>{escape(cell)}</th>" for k, cell in enumerate(head)), "</tr>"]
     for index, line in enumerate(lines):
         parts.append('<tr class="fused">' if line and line[0].startswith("fused") else "<tr>")
         for k, cell in enumerate(line):
             mark = marks.get((index, k), "")
-            classes = " ".join(filter(None, (mark, "left" if 0 < k < left else "")))
+            classes = " ".join(filter(None, (mark, "left" if 0 < k < left or (k and not head[k]) else "")))
             parts.append(f'<td class="{classes}">' if classes else "<td>")
             parts.append(f"{escape(cell)}</td>")
         parts.append("</tr>")
@@ -137,7 +147,8 @@ def _against_truth(row: Row) -> list[str]:
     lines = [
         [
             name,
-            *map(digits, (one.rmse_position, one.gospa, one.gospa_localisation, one.gospa_missed, one.gospa_false)),
+            *map(digits, (one.rmse_position, one.gospa)),
+            *map(_short, (one.gospa_localisation, one.gospa_missed, one.gospa_false)),
             fixed(one.anees),
             fixed(*one.bounds),
             str(one.identity_switches),
@@ -191,9 +202,11 @@ def _against_truth(row: Row) -> list[str]:
 
 
 def _without_truth(one: Assessment, which: str) -> list[str]:
+    from fusion_service.picture import source_colours
     from fusion_service.report_charts import delay_chart
 
     book = one.book
+    colours = source_colours([*book.sources, *book.infos])
     found = [f"<h2>Without any truth{escape(which)}</h2>"]
     for name, agreement in list(one.agreements.items())[:1]:
         if any(pair.n for pair in agreement.pairs.values()):
@@ -204,7 +217,8 @@ def _without_truth(one: Assessment, which: str) -> list[str]:
         if shown:
             parts = [(str(n) if n else "none, coasting", count) for n, count in sorted(account.shown.items())]
             found.append(f"<h3>How many sources feed a confirmed track{escape(of)}</h3>")
-            found.append(_table([n for n, _ in parts], [[percent(count / shown) for _, count in parts]]))
+            shares = [["share", *(percent(count / shown) for _, count in parts)]]
+            found.append(_table(["sources", *(n for n, _ in parts)], shares))
         if account.innovation:
             lines = []
             for source, (n, total) in sorted(account.innovation.items()):
@@ -238,7 +252,9 @@ def _without_truth(one: Assessment, which: str) -> list[str]:
             "<h3>Delays</h3>",
             _table(("", "of", "messages", "median, ms", "95 %, ms", "largest, ms"), lines, left=2),
         ]
-        figures = [f"<figure>{delay_chart(some, DELAYS[kind].capitalize())}</figure>" for kind, some in delays if some]
+        figures = [
+            f"<figure>{delay_chart(some, colours, DELAYS[kind].capitalize())}</figure>" for kind, some in delays if some
+        ]
         found.append(f'<div class="charts">{"".join(figures)}</div>')
     return found
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.logbook import BINS
 from fusion_service.picture import FUSED, SOURCES, source_colours
 from fusion_service.scoring import WINDOW, Scores
 from fusion_service.tables import Row
@@ -27,6 +28,7 @@ Floats = NDArray[np.float64]
 POINTS = 500
 """Points of a line, at most: means over equal parts of the mission where there are more times."""
 SIZE = (5.0, 3.0)
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 PARTS = {"localisation": "#56b4e9", "missed": "#e69f00", "false": "#d55e00"}
 STYLE: Any = {
     "svg.fonttype": "none",
@@ -96,15 +98,16 @@ def charts(rows: Sequence[Row]) -> list[tuple[str, str]]:
     return found
 
 
-def delay_chart(delays: dict[str, Latency], title: str) -> str:
-    """Histograms of delays, each as shares of its own messages."""
-    colours = source_colours(delays)
+def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str) -> str:
+    """Histograms of delays, each as shares of its own messages; what has no colour of its own is black."""
 
     def draw(axes: Axes) -> None:
         for name, delay in delays.items():
-            share = np.array(delay.counts) / delay.n
-            edges = 1000 * np.array(delay.edges)
-            axes.stairs(100 * share, edges, color=colours[name], label=name, lw=1.4)
+            wide = next((wide for wide in (8, 5, 4, 2, 1) if BINS // wide >= np.sqrt(delay.n)), 1)
+            wide = 8 if delay.n < 64 else wide
+            share = np.array(delay.counts).reshape(-1, wide).sum(axis=1) / delay.n
+            edges = 1000 * np.array(delay.edges)[::wide]
+            axes.stairs(100 * share, edges, color=colours.get(name, FUSED), label=name, lw=1.4)
         axes.set(xlabel="delay, ms", ylabel="messages, %", ylim=(0, None))
         _legend(axes)
 
@@ -157,10 +160,11 @@ def _thin(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 def _parts(axes: Axes, row: Row) -> None:
     series, seconds = row.evaluation.fused.series, _seconds(row.evaluation.times)
-    layers = [_thin(seconds, getattr(series, name))[1] for name in PARTS]
+    power = 3 * int(np.floor(np.log10(max(float((series.gospa**2).max()), 1.0)) / 3))
+    layers = [_thin(seconds, getattr(series, name))[1] / 10**power for name in PARTS]
     axes.stackplot(_thin(seconds, series.gospa)[0], *layers, labels=list(PARTS), colors=list(PARTS.values()), lw=0)
-    axes.set(xlabel="s since the first scored time", ylabel="m²", ylim=(0, None))
-    axes.ticklabel_format(axis="y", scilimits=(-3, 4))
+    unit = f"10{str(power).translate(RAISED)} m²" if power else "m²"
+    axes.set(xlabel="s since the first scored time", ylabel=unit, ylim=(0, None))
     _legend(axes)
 
 
@@ -231,11 +235,12 @@ def _confirm(axes: Axes, rows: Sequence[Row]) -> None:
 
 def _legend(axes: Axes) -> None:
     """Above the picture, so that it hides nothing."""
-    handles, _ = axes.get_legend_handles_labels()
+    handles, labels = axes.get_legend_handles_labels()
+    room = 58 - 7 * len(handles) - sum(map(len, labels))
     axes.legend(
         loc="lower left",
         bbox_to_anchor=(-0.02, 1.0),
-        ncols=min(len(handles), 4),
+        ncols=len(handles) if room > 0 else max(1, min(3, 50 // (7 + max(map(len, labels))))),
         columnspacing=1.2,
         handlelength=1.4,
         borderaxespad=0.1,
