@@ -47,7 +47,7 @@ Tracks = LocalTracks | GlobalTracks
 
 BLOCK = 32
 """Times scored at once."""
-SPREADS = 20.0
+SPREADS = 10.0
 """Without a given cut-off: so many standard deviations of the fused position, rounded up to 1, 2 or 5 times 10^n."""
 
 

@@ -69,7 +69,7 @@ def facts(assessment: Assessment) -> dict[str, str]:
     }
     if book.bad:
         found["not read"] = ", ".join(f"{count} messages: {reason}" for reason, count in sorted(book.bad.items()))
-    chosen = " (chosen: 20 times the typical standard deviation)" if assessment.chosen else ""
+    chosen = " (chosen: about 10 times the typical standard deviation)" if assessment.chosen else ""
     found["cut-off"] = f"{assessment.c:g} m{chosen}"
     return found
 
