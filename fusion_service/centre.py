@@ -22,7 +22,7 @@ from fusion_service.config import CentreConfig, centre_config, config_hash
 from fusion_service.fusing import fuse_all
 from fusion_service.health import step_status
 from fusion_service.intake import Event, Intake, Order, Refused, SourceFound, SourceLost
-from fusion_service.journal import Journal
+from fusion_service.journal import Journal, start_event
 from fusion_service.lifecycle import Picture, empty_picture
 from fusion_service.linking import Linker
 from fusion_service.presence import existence_now
@@ -33,8 +33,6 @@ from schemas import messages as words
 
 __all__ = ["FusionCentre", "Order", "Refused", "SourceFound", "SourceLost", "StepResult"]
 
-MOST_LOGGED = 8 * 2**20
-"""A checkpoint above this size is not part of the log of the first step: that mission cannot be made again."""
 VERSION = metadata.version("track-fusion-centre")
 
 
@@ -75,14 +73,11 @@ class FusionCentre:
         self._published = 0
         self._time = -1
         self._journal = Journal(self.config.name, self.config_hash, VERSION)
-        start: dict[str, Any] = {"kind": "start", "epoch": epoch}
         if checkpoint is not None:
             self._restore(checkpoint)
-            start |= {"checkpoint": checkpoint} if len(checkpoint) <= MOST_LOGGED else {"left_out": len(checkpoint)}
         if generation is not None:
             self._linker.next_id = (generation << 32) + 1
-            start["generation"] = generation
-        self._journal.event(start)
+        self._journal.event(start_event(self.config, epoch, generation, checkpoint))
 
     @property
     def time(self) -> int:

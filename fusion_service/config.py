@@ -124,10 +124,12 @@ def _table(value: Any) -> dict[str, Any]:
     return dict(value)
 
 
+def _parts(value: Any) -> dict[str, Any]:
+    return {one.name: getattr(value, one.name) for one in fields(value)}
+
+
 def _build(kind: type[T], value: Any) -> T:
-    if isinstance(value, kind):
-        return value
-    table = _table(value)
+    table = _parts(value) if isinstance(value, kind) else _table(value)
     known = {one.name: one.type for one in fields(kind)}  # type: ignore[arg-type]
     needed = {one.name for one in fields(kind) if one.default is dataclasses.MISSING}  # type: ignore[arg-type]
     if not needed <= set(table) <= set(known):
@@ -143,9 +145,9 @@ def _build(kind: type[T], value: Any) -> T:
 
 
 def _frame(value: Any) -> Frame | None:
-    if value is None or isinstance(value, (Enu, Ecef, Local)):
-        return value
-    table = _table(value)
+    if value is None:
+        return None
+    table = {"kind": value.kind, **_parts(value)} if isinstance(value, (Enu, Ecef, Local)) else _table(value)
     kinds: dict[str, type[Any]] = {"enu": Enu, "ecef": Ecef, "local": Local}
     kind = table.pop("kind", None)
     if not isinstance(kind, str) or kind not in kinds:

@@ -23,8 +23,9 @@ from pathlib import Path
 from typing import Any
 
 from fusion_service.bus import open_bus
-from fusion_service.config import ConfigError, centre_config, load_config
+from fusion_service.config import centre_config, load_config
 from fusion_service.progress import Progress
+from fusion_service.settings import change, merge
 from fusion_service.toml_text import dotted, toml_value
 from schemas import GlobalTracks, MessageError, decode, global_key, local_key
 
@@ -200,8 +201,8 @@ def run_demo(
     settings = {"clock": "message", "rule": rule, "rule_options": options, "memory": memory, **mission.settings(speed)}
     if tracker == "gm-phd":
         settings |= {"kind": "intensity", "rule": "ci", "rule_options": {}}
-    for change in changes:
-        _merge(settings, _setting(change))
+    for text in changes:
+        merge(settings, change(text))
     centre = centre_config(settings)
     rule = centre.intensity_rule if centre.kind == "intensity" else centre.rule
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
@@ -225,27 +226,6 @@ def run_demo(
         print(f"stopped; the recording so far: {recording}")
         return {}
     return _report(mission, rule, recording, folder, json_path)
-
-
-def _setting(change: str) -> dict[str, Any]:
-    """What KEY=VALUE says, VALUE as TOML writes it, or a text without its quotes. `ConfigError` if it is neither."""
-    key, equals, value = change.partition("=")
-    if equals and "\n" not in change:
-        for one in (value, toml_value(value.strip())):
-            try:
-                return tomllib.loads(f"{key} = {one}")
-            except (ValueError, RecursionError):
-                continue
-    raise ConfigError([f"--set {change}: write KEY=VALUE, as in --set gate=0.99"])
-
-
-def _merge(into: dict[str, Any], more: Mapping[str, Any]) -> None:
-    """Put `more` into a table, and its tables into those that are there."""
-    for key, value in more.items():
-        if isinstance(value, dict) and isinstance(into.get(key), dict):
-            _merge(into[key], value)
-        else:
-            into[key] = value
 
 
 def _toml_table(name: str, table: Mapping[str, Any]) -> str:

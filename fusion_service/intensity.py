@@ -24,14 +24,14 @@ from scipy.stats import chi2
 from fusion_service import linalg
 from fusion_service.association import candidate_pairs, cluster, pair_distance
 from fusion_service.cells import Components, find_cells, fuse_cells, reduced
-from fusion_service.centre import MOST_LOGGED, VERSION, StepResult
+from fusion_service.centre import VERSION, StepResult
 from fusion_service.checkpoint import pack_state, unpack_state
 from fusion_service.config import CentreConfig, centre_config, config_hash
 from fusion_service.coverage import covers
 from fusion_service.densities import Mixture
 from fusion_service.health import step_status
 from fusion_service.intake import Event, Intake, Order
-from fusion_service.journal import Journal
+from fusion_service.journal import Journal, start_event
 from fusion_service.lifecycle import Picture, empty_picture, newborn
 from fusion_service.motion import predict
 from fusion_service.publishing import Contributions, live_on, picture_message
@@ -74,15 +74,12 @@ class IntensityCentre:
         self._published = 0
         self._time = -1
         self._journal = Journal(self.config.name, self.config_hash, VERSION)
-        start: dict[str, Any] = {"kind": "start", "epoch": epoch}
         if checkpoint is not None:
             state, self._picture = unpack_state(checkpoint, self._intake, space)
             self._step, self._time, self._next_id = state["step"], state["time"], state["next_id"]
-            start |= {"checkpoint": checkpoint} if len(checkpoint) <= MOST_LOGGED else {"left_out": len(checkpoint)}
         if generation is not None:
             self._next_id = (generation << 32) + 1
-            start["generation"] = generation
-        self._journal.event(start)
+        self._journal.event(start_event(self.config, epoch, generation, checkpoint))
 
     @property
     def time(self) -> int:

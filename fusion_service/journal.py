@@ -8,18 +8,34 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.settings import recordable
 from schemas import Decisions, Entry, StepLog
 from schemas import messages as words
 
 if TYPE_CHECKING:
+    from fusion_service.config import CentreConfig
     from fusion_service.rows import Rows
 
-__all__ = ["Journal"]
+__all__ = ["Journal", "start_event"]
 
 MOST_ENTRIES = 1000
 """Refusals and drops named one by one in a log; what is beyond is one entry with their number ("more")."""
 NO_SOURCE = 65535
+MOST_LOGGED = 8 * 2**20
+"""A checkpoint above this size is not part of the log of the first step."""
 _DTYPES = (np.uint8, np.uint64, np.uint16, np.uint64, np.uint64, np.uint64, np.float64)
+
+
+def start_event(config: CentreConfig, epoch: int, generation: int | None, checkpoint: bytes | None) -> dict[str, Any]:
+    """What a run begins with, all of it: enough for another centre to begin as this one."""
+    start: dict[str, Any] = {"kind": "start", "epoch": epoch}
+    if (settings := recordable(config)) is not None:
+        start["config"] = settings
+    if checkpoint is not None:
+        start |= {"checkpoint": checkpoint} if len(checkpoint) <= MOST_LOGGED else {"left_out": len(checkpoint)}
+    if generation is not None:
+        start["generation"] = generation
+    return start
 
 
 class Journal:

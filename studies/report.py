@@ -148,21 +148,45 @@ def page(studies: Iterable[Study], folder: Path = FOLDER) -> str:
 
 
 def _tables(study: Study, values: Mapping[str, Any]) -> list[str]:
-    """One table with a column a quantity, published numbers in brackets; a long one where that would be too wide."""
+    """One table with a column a quantity, published numbers in brackets. Where that would be too wide: a table for each
+    group, if all quantities are called "group: column"; a long one else."""
     rows = _rows(values)
     quantities = list(dict.fromkeys(row.quantity for row in rows))
     names = list(dict.fromkeys(row.name for row in rows))
     cells = {(row.name, row.quantity): row for row in rows}
-    if len(quantities) > WIDEST or len(cells) < 0.6 * len(quantities) * len(names) or len(cells) < len(rows):
+    groups: dict[str, list[str]] = {}
+    for quantity in quantities:
+        groups.setdefault(quantity.partition(": ")[0], []).append(quantity)
+    sparse = len(cells) < 0.6 * len(quantities) * len(names) or len(cells) < len(rows)
+    if not sparse and len(quantities) <= WIDEST:
+        return _grid(study, values, names, {quantity: quantity for quantity in quantities}, cells)
+    if sparse or max(map(len, groups.values())) > WIDEST or not all(": " in quantity for quantity in quantities):
         lines = ["| | quantity | published | ours | |", "|---|---|---|---|---|"]
         for row in rows:
             verdict = compared(row, values["runs"], study.published_runs)
             lines.append(f"| {row.name} | {row.quantity} | {printed(row)} | {_ours(row)} | {verdict} |")
         return lines
-    lines = ["| | " + " | ".join(quantities) + " |", "|---" * (len(quantities) + 1) + "|"]
+    lines = []
+    for head, group in groups.items():
+        columns = {quantity: quantity.partition(": ")[2] for quantity in group}
+        there = [name for name in names if any((name, quantity) in cells for quantity in group)]
+        lines += [*([""] if lines else []), f"{head[0].upper()}{head[1:]}:", ""]
+        lines += _grid(study, values, there, columns, cells)
+    return lines
+
+
+def _grid(
+    study: Study,
+    values: Mapping[str, Any],
+    names: Iterable[str],
+    columns: Mapping[str, str],
+    cells: Mapping[tuple[str, str], Row],
+) -> list[str]:
+    """columns: the heading of every quantity."""
+    lines = ["| | " + " | ".join(columns.values()) + " |", "|---" * (len(columns) + 1) + "|"]
     for name in names:
         line = []
-        for quantity in quantities:
+        for quantity in columns:
             one = cells.get((name, quantity))
             if one is None:
                 line.append("")

@@ -25,13 +25,20 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Fuser:
-    """A rule with its options; `weights`: "uniform", or None to let the rule choose. `function`: one of your own."""
+    """A rule with its options; `weights`: "uniform", or None to let the rule choose. `function`: one of your own, and
+    `text`: how the command line named it, by which another process finds it again."""
 
     label: str
     rule: str = ""
     options: tuple[tuple[str, Any], ...] = ()
     weights: str | None = None
     function: Callable[[Floats, Floats], tuple[Floats, Floats]] | None = None
+    text: str = ""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        if self.text:
+            return fuser, (self.text,)
+        return Fuser, (self.label, self.rule, self.options, self.weights, self.function)
 
     def __call__(self, means: Floats, covariances: Floats) -> Fused:
         """Fuse means (N, n, B) and covariances (N, n, n, B): mean (n, B), covariance (n, n, B), weights (N, B)."""
@@ -86,4 +93,4 @@ def _own(path: Path, name: str) -> Fuser:
     function = getattr(module, name, None)
     if not callable(function):
         raise ValueError(f"{path} has no function {name!r}: write {path}:FUNCTION")
-    return Fuser(f"{path.stem}.{name}", function=function)
+    return Fuser(f"{path.stem}.{name}", function=function, text=f"{path}:{name}")

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from fusion_service.commands import evaluate, export
+from fusion_service.commands import evaluate, explain, export, replay
 
 __all__ = ["COMMANDS"]
 
-COMMANDS: tuple[ModuleType, ...] = (evaluate, export)
+COMMANDS: tuple[ModuleType, ...] = (replay, evaluate, explain, export)
 """In the order of the help; a command is called as its module, with hyphens."""

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from fusion_service.recording import palette
 from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
 from fusion_service.recording.geometry import CORNERS, Chart, Outline, Place, ellipses, grid, moments, outline
+from fusion_service.recording.labels import Labels
 from fusion_service.recording.tables import COASTING, LEVELS, Table, components, hold, levels, tabulate
 from schemas import Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
@@ -56,7 +57,7 @@ class Drawing:
         self.sources: dict[str, str] = {}
         self.colours: dict[str, palette.Colour] = {}
         self.changed = True
-        self._generations: dict[int, int] = {}
+        self.label = Labels()
         self._tables: dict[str, Table] = {}
         self._tones: dict[str, palette.Colour] = {}
         self._mixed: set[str] = set()
@@ -74,13 +75,6 @@ class Drawing:
             x, y, z = (float(message.means[0, message.space.index(name)]) for name in "xyz")
             near = x, y, z
         self.chart = Chart(message.frame, near)
-
-    def label(self, track: int) -> str:
-        """A global id by its lower half, a counter; from the second generation (upper half) seen on, after the number
-        of its generation: 7, 2.7."""
-        generation, counter = divmod(int(track), 1 << 32)
-        number = self._generations.setdefault(generation, len(self._generations) + 1)
-        return f"{number}.{counter}" if number > 1 else str(counter)
 
     @property
     def extent(self) -> tuple[Floats, Floats] | None:

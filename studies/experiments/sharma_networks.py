@@ -6,7 +6,6 @@ and every measurement.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from typing import Any
@@ -119,8 +118,6 @@ def run(run: Run, number: int) -> Result:
     chunks = max(1, run.runs // CHUNK)
     sizes = [len(part) for part in np.array_split(np.arange(run.runs), chunks)]
     items = [(prior, chunk, size, max(1, GROUPS // chunks)) for prior in PRIORS for chunk, size in enumerate(sizes)]
-    if any(rule.function for rule in run.rules):
-        run = replace(run, jobs=1)  # other processes do not know a function out of a file
     parts = run.map(partial(simulate, number=number, seed=run.seed, extra=run.rules), items, "through the network")
     blocks = {
         key: np.concatenate([part[key] for part in parts if key in part], axis=-1) for one in parts for key in one
