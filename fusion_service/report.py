@@ -17,13 +17,16 @@ from fusion_service.report_text import CSS, WORDS
 from fusion_service.results import facts, label, rows_of, rule_of, utc
 from fusion_service.tables import (
     DELAYS,
+    NUMBERS,
     Row,
     best_rows,
+    comparison,
     confirm_line,
     digits,
     fixed,
     pair_words,
     percent,
+    row_name,
     rules_table,
     sentence,
     tracking_table,
@@ -50,7 +53,8 @@ def report(assessments: Sequence[Assessment]) -> str:
     rows = rows_of(assessments)
     title = ", ".join(dict.fromkeys(label(one) or "mission" for one in assessments))
     body = [f"<h1>Mission review: {escape(title)}</h1>"]
-    body += [f'<p class="lead">{escape(sentence(row))}</p>' for row in rows[:1]]
+    if rows:
+        body.append(f'<p class="lead">{escape(sentence(rows[0]) if len(rows) == 1 else comparison(rows))}</p>')
     for one in assessments:
         if one.unscored:
             text = f"{label(one) or 'The mission'}: {one.unscored}. What follows needs no truth."
@@ -59,8 +63,10 @@ def report(assessments: Sequence[Assessment]) -> str:
     if len(rows) > 1:
         body += ["<h2>Rules beside each other</h2>", _rules(rows)]
     body += _map(assessments[0])
-    for row in rows:
-        body += [f"<h2>Against the truth{_which(row, rows)}</h2>", *_against_truth(row)]
+    for one in assessments:
+        if group := rows_of([one]):
+            which = f": {escape(label(one))}" if len(assessments) > 1 else ""
+            body += [f"<h2>Against the truth{which}</h2>", *_against_truth(group)]
     if rows:
         figures = [f"<figure>{svg}<figcaption>{escape(text)}</figcaption></figure>" for svg, text in charts(rows)]
         body += ["<h2>Over time</h2>", f'<div class="charts">{"".join(figures)}</div>']
@@ -74,12 +80,6 @@ def report(assessments: Sequence[Assessment]) -> str:
         f"<title>Mission review: {escape(title)}</title><style>{CSS}</style></head>"
     )
     return f"{head}<body>{''.join(body)}</body></html>\n"
-
-
-def _which(row: Row, rows: Sequence[Row]) -> str:
-    if len(rows) == 1:
-        return ""
-    return escape(f": {row.rule}, {row.centre}" + (f" of {row.recording}" if row.recording else ""))
 
 
 def _short(value: float) -> str:
@@ -121,8 +121,8 @@ def _rules(rows: Sequence[Row]) -> str:
     head, *lines = rules_table(rows)
     best = best_rows(rows)
     marks = {(index, k): "best" for k, name in enumerate(head) for index in best.get(name, ())}
-    note = '<p class="note">The best of each column is marked (ANEES: nearest to 1). GOSPA, OSPA, RMSE in m.</p>'
-    return _table(head, lines, marks, left=len(head) - 8) + note
+    note = '<p class="note">The best of each column is marked (ANEES: nearest to 1). GOSPA, OSPA, RMSE in m; 2+: targets that several sources track.</p>'
+    return _table(head, lines, marks, left=len(head) - NUMBERS) + note
 
 
 def _map(one: Assessment) -> list[str]:
@@ -142,8 +142,11 @@ def _map(one: Assessment) -> list[str]:
     ]
 
 
-def _against_truth(row: Row) -> list[str]:
-    evaluation = row.evaluation
+def _against_truth(rows: Sequence[Row]) -> list[str]:
+    """Of the rows of one recording."""
+    evaluation = rows[0].evaluation
+    fused = {f"fused ({row_name(row, rows) if len(rows) > 1 else row.rule})": row.evaluation for row in rows}
+    scored = {**evaluation.sources, **{name: one.fused for name, one in fused.items()}}
     lines = [
         [
             name,
@@ -153,13 +156,9 @@ def _against_truth(row: Row) -> list[str]:
             fixed(*one.bounds),
             str(one.identity_switches),
         ]
-        for name, one in [*evaluation.sources.items(), (f"fused ({row.rule})", evaluation.fused)]
+        for name, one in scored.items()
     ]
-    marks = {}
-    for index, one in enumerate([*evaluation.sources.values(), evaluation.fused]):
-        if np.isfinite(one.anees):
-            low, high = one.bounds
-            marks[index, 6] = "low" if one.anees < low else "high" if one.anees > high else "good"
+    marks = {(index, 6): _mark(one.anees, one.bounds) for index, one in enumerate(scored.values())}
     head = (
         "",
         "RMSE, m",
@@ -181,24 +180,35 @@ def _against_truth(row: Row) -> list[str]:
     if evaluation.seen.max(initial=0) > 1:
         shared = [
             [
-                name.replace("_", " "),
-                str(one["pairs"]),
-                digits(one["fused_rmse"]),
-                digits(one["best_rmse"]),
-                fixed(one["fused_anees"]),
-                fixed(one["best_anees"]),
-                fixed(*one["nees_bounds"]),
-                str(one["fused_missed"]),
+                name if len(rows) > 1 else kind.replace("_", " "),
+                str(line["pairs"]),
+                digits(line["fused_rmse"]),
+                digits(line["best_rmse"]),
+                fixed(line["fused_anees"]),
+                fixed(line["best_anees"]),
+                fixed(*line["nees_bounds"]),
+                str(line["fused_missed"]),
             ]
-            for name, one in evaluation.shared.items()
+            for name, one in fused.items()
+            for kind, line in one.shared.items()
+            if len(rows) == 1 or kind == "seen_by_2_or_more"
         ]
         found += ["<h3>What fusion gains: targets that several sources track</h3>", _table(SHARED, shared)]
         text = "On the same pairs of target and time. The best single source is found with the truth, for each target."
         found.append(f'<p class="note">{text}</p>')
-    names, *following = tracking_table(evaluation)
+    names, *following = tracking_table(scored, len(evaluation.targets))
     found += ["<h3>How well tracks hold on to targets</h3>", _table(names, following)]
-    found.append(f"<p>{escape(confirm_line(evaluation))}</p>")
+    told: dict[str, list[str]] = {}
+    for name, one in fused.items():
+        told.setdefault(confirm_line(one), []).append(name)
+    found += [f"<p>{escape(line + ('' if len(told) == 1 else ' ' + ', '.join(of)))}</p>" for line, of in told.items()]
     return found
+
+
+def _mark(value: float, bounds: tuple[float, float]) -> str:
+    """The class of a cell with a mean that lies within `bounds`, below or above; none without one."""
+    low, high = bounds
+    return "" if not np.isfinite(value) else "low" if value < low else "high" if value > high else "good"
 
 
 def _without_truth(one: Assessment, which: str) -> list[str]:
@@ -272,8 +282,7 @@ def _matrix(one: Assessment, centre: str) -> str:
                 marks[row, column + 1] = "none"
                 continue
             line.append(fixed(pair.mean))
-            low, high = pair.bounds
-            marks[row, column + 1] = "low" if pair.mean < low else "high" if pair.mean > high else "good"
+            marks[row, column + 1] = _mark(pair.mean, pair.bounds)
         lines.append(line)
     for a, b in combinations(names, 2):
         pair = pairs[a, b]

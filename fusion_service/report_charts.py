@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from fusion_service.logbook import BINS
 from fusion_service.picture import FUSED, SOURCES, source_colours
 from fusion_service.scoring import WINDOW, Scores
-from fusion_service.tables import Row
+from fusion_service.tables import Row, row_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -128,18 +128,9 @@ def _lines(rows: Sequence[Row]) -> list[tuple[str, str, float, Scores, Floats]]:
         return [*lines, (f"fused, {rows[0].rule}", FUSED, 2.0, first.fused, seconds)]
     palette = (FUSED, *SOURCES)
     return [
-        (_name(row, rows), palette[k % len(palette)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
+        (row_name(row, rows), palette[k % len(palette)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
         for k, row in enumerate(rows)
     ]
-
-
-def _name(row: Row, rows: Sequence[Row]) -> str:
-    """As short as tells it from the others."""
-    if len({one.rule for one in rows}) == len(rows):
-        return row.rule
-    if len({(one.centre, one.rule) for one in rows}) == len(rows):
-        return f"{row.centre}: {row.rule}"
-    return f"{row.recording}, {row.centre}: {row.rule}"
 
 
 def _seconds(times: NDArray[np.int64]) -> Floats:
@@ -226,7 +217,7 @@ def _confirm(axes: Axes, rows: Sequence[Row]) -> None:
         if not known or not len(after):
             continue
         x, y = np.append(after, after[-1] * 1.08 + 1), np.append(np.arange(1, len(after) + 1), len(after))
-        label = _name(row, rows) if len(rows) > 1 else None
+        label = row_name(row, rows) if len(rows) > 1 else None
         axes.step([0, *x], [0, *(100 * y / known)], where="post", color=palette[k % len(palette)], label=label)
     axes.set(xlabel="s since it could be known", ylabel="targets confirmed, %", ylim=(0, 104), xlim=(0, None))
     if len(rows) > 1:

@@ -10,8 +10,10 @@ from typing import Any
 from fusion_service.evaluation import Assessment
 from fusion_service.scoring import plain
 from fusion_service.tables import (
+    NUMBERS,
     Row,
     aligned,
+    comparison,
     confirm_line,
     format_table,
     rules_table,
@@ -75,23 +77,27 @@ def facts(assessment: Assessment) -> dict[str, str]:
 
 
 def text(assessments: Sequence[Assessment]) -> str:
-    """The plain summary: first in words, then tables."""
+    """The plain summary: first in words, then tables; of several centres of a recording the tables of the first."""
     rows, lines = rows_of(assessments), []
-    lines += [sentence(row) for row in rows[:1]]
+    if rows:
+        lines.append(sentence(rows[0]) if len(rows) == 1 else comparison(rows))
     lines += [f"{label(one) or 'The mission'}: {one.unscored}." for one in assessments if one.unscored]
     if len(rows) > 1:
-        lines += ["", *aligned(rules_table(rows), left=len(rules_table(rows)[0]) - 8)]
+        lines += ["", *aligned(rules_table(rows), left=len(rules_table(rows)[0]) - NUMBERS)]
     for one in assessments:
         centre = next(iter(one.evaluations), next(iter(one.agreements), ""))
         lines += ["", f"{one.book.path or 'mission'}" + (f", cut-off {facts(one)['cut-off']}" if one.chosen else "")]
         if one.book.bad:
             lines.append(f"not read: {facts(one)['not read']}")
-        for name, evaluation in one.evaluations.items():
+        if one.evaluations:
+            evaluation = one.evaluations[centre]
             if len(one.evaluations) > 1:
-                lines += ["", f"{name}: {rule_of(one, name)}"]
-            lines += [format_table(evaluation), "", *aligned(tracking_table(evaluation)), confirm_line(evaluation)]
+                lines.append(f"of {centre} (--centre NAME shows another, --html and --json all of them):")
+            scored = {**evaluation.sources, "fused": evaluation.fused}
+            lines += [format_table(evaluation), ""]
+            lines += [*aligned(tracking_table(scored, len(evaluation.targets))), confirm_line(evaluation)]
         lines += ["", *truthless_lines(one, centre)]
-    return "\n".join(lines)
+    return "\n".join(line for k, line in enumerate(lines) if line or k == 0 or lines[k - 1])
 
 
 def results(assessments: Sequence[Assessment]) -> dict[str, Any]:

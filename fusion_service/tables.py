@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -11,13 +11,16 @@ if TYPE_CHECKING:
     from fusion_service.consistency import Pair
     from fusion_service.evaluation import Assessment, Evaluation
     from fusion_service.logbook import Account
+    from fusion_service.scoring import Scores
 
 __all__ = [
     "DELAYS",
+    "NUMBERS",
     "RULES",
     "Row",
     "aligned",
     "best_rows",
+    "comparison",
     "confirm_line",
     "consistent",
     "digits",
@@ -26,6 +29,7 @@ __all__ = [
     "metres",
     "pair_words",
     "percent",
+    "row_name",
     "rules_table",
     "sentence",
     "tracking_table",
@@ -109,6 +113,36 @@ def sentence(row: Row) -> str:
     return "; ".join(text) + "."
 
 
+def row_name(row: Row, rows: Sequence[Row]) -> str:
+    """As short as tells it from the others."""
+    if len({one.rule for one in rows}) == len(rows):
+        return row.rule
+    name = row.centre if row.centre == row.rule else f"{row.centre} ({row.rule})"
+    if len({one.centre for one in rows}) == len(rows):
+        return name
+    alone = len({one.recording for one in rows}) == len(rows)
+    return f"{row.recording} ({row.rule})" if alone else f"{row.recording}, {name}"
+
+
+def comparison(rows: Sequence[Row]) -> str:
+    """Which of several rows are best at what, in words."""
+    fused = [row.evaluation.fused for row in rows]
+    parts = []
+    for what, values, say in (
+        ("smallest GOSPA", [one.gospa for one in fused], metres),
+        ("smallest error", [one.rmse_position for one in fused], lambda value: f"RMSE {metres(value)}"),
+        ("best consistency", [abs(one.anees - 1) for one in fused], lambda _: ""),
+    ):
+        if np.isfinite(values).any():
+            best = int(np.nanargmin(values))
+            said = say(values[best]) or f"ANEES {fused[best].anees:.2f}"
+            parts.append(f"{what}: {row_name(rows[best], rows)} ({said})")
+    text = "; ".join(parts)
+    followed = sorted({(one.followed, len(row.evaluation.targets)) for one, row in zip(fused, rows, strict=True)})
+    counts = " to ".join(f"{n} of {of}" for n, of in ([followed[0], followed[-1]] if len(followed) > 1 else followed))
+    return f"{len(rows)} fusions, which followed {counts} targets; {text}."
+
+
 def consistent(anees: float, bounds: tuple[float, float]) -> str:
     """What an ANEES says of the covariances."""
     low, high = bounds
@@ -132,9 +166,25 @@ def metres(value: float) -> str:
     return f"{number:.{max(0, 2 - int(np.floor(np.log10(abs(number)))))}f} {unit}" if number else f"0 {unit}"
 
 
-RULES = ("recording", "centre", "rule", "followed", "GOSPA", "OSPA", "OSPA(2)", "RMSE", "ANEES", "switches", "complete")
-"""Columns of the table of rules; of the numbers the lower is the better, ANEES by its distance from 1, but of followed
+RULES = (
+    "recording",
+    "centre",
+    "rule",
+    "followed",
+    "GOSPA",
+    "OSPA",
+    "OSPA(2)",
+    "RMSE",
+    "RMSE, 2+",
+    "ANEES",
+    "switches",
+    "complete",
+)
+"""Columns of the table of rules ("RMSE, 2+": of targets that two sources or more track); of the numbers the lower is the better, ANEES by its distance from 1, but of followed
 and complete the higher."""
+
+NUMBERS = len(RULES) - 3
+"""Of its columns the last ones."""
 
 
 def rules_table(rows: Sequence[Row]) -> list[list[str]]:
@@ -146,7 +196,13 @@ def rules_table(rows: Sequence[Row]) -> list[list[str]]:
 
 def _cells(row: Row) -> list[str]:
     fused = row.evaluation.fused
-    numbers = (fused.gospa, fused.ospa, fused.ospa2, fused.rmse_position)
+    numbers = (
+        fused.gospa,
+        fused.ospa,
+        fused.ospa2,
+        fused.rmse_position,
+        row.evaluation.shared["seen_by_2_or_more"]["fused_rmse"],
+    )
     return [
         row.recording,
         row.centre,
@@ -168,6 +224,7 @@ def best_rows(rows: Sequence[Row]) -> dict[str, set[int]]:
         "OSPA": [one.ospa for one in fused],
         "OSPA(2)": [one.ospa2 for one in fused],
         "RMSE": [one.rmse_position for one in fused],
+        "RMSE, 2+": [row.evaluation.shared["seen_by_2_or_more"]["fused_rmse"] for row in rows],
         "ANEES": [abs(one.anees - 1) for one in fused],
         "switches": [one.identity_switches for one in fused],
         "complete": [-one.siap.completeness for one in fused],
@@ -181,18 +238,18 @@ def best_rows(rows: Sequence[Row]) -> dict[str, set[int]]:
     return found
 
 
-def tracking_table(evaluation: Evaluation) -> list[list[str]]:
-    """Sources and fused tracks: OSPA, and how they hold on to targets."""
+def tracking_table(scored: Mapping[str, Scores], targets: int) -> list[list[str]]:
+    """Sources and fused tracks by name: OSPA, and how they hold on to targets."""
     head = "OSPA,OSPA(2),followed,complete,ambiguity,spurious,PA m,VA m/s,changes/h,longest"
     table = [["", *head.split(",")]]
-    for name, one in [*evaluation.sources.items(), ("fused", evaluation.fused)]:
+    for name, one in scored.items():
         siap = one.siap
         table.append(
             [
                 name,
                 digits(one.ospa),
                 digits(one.ospa2),
-                f"{one.followed}/{len(evaluation.targets)}",
+                f"{one.followed}/{targets}",
                 percent(siap.completeness),
                 fixed(siap.ambiguity),
                 percent(siap.spuriousness),
