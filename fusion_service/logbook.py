@@ -2,9 +2,9 @@
 
 * A message's place is (time, kind, source, epoch, seq, arrival). `Logbook.tracks` gives tracks in this order; of a
   recording it holds back only what came before its turn, as bytes.
-* Latency, each where there are clocks for it: "bus", from `sent` to the recorder's `received`; "source" and "centre",
-  from the time of the tracks to `sent`, where they are within `SAME_CLOCK` for most messages (not in a mission played
-  faster than real time); "reaction", from the reception of the last message that a step took to that of its picture.
+* Latency, of what is no replay: "bus", from `sent` to the recorder's `received`; "source" and "centre", from the time of
+  the tracks to `sent`; "reaction", from the reception of the last message that a step took to that of its picture. Each
+  where most messages show less than `SAME_CLOCK`: a mission played at another time or pace has its own clock.
 * A sequence number of an epoch that is missing between the first and the last is a gap; a source that says nothing for
   more than `SILENT` of its periods (declared, else the median interval) is silent.
 """
@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,11 +31,15 @@ __all__ = ["Account", "Latency", "Logbook", "Silence", "Traffic"]
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 Tracks = LocalTracks | GlobalTracks
+Step = tuple[str, int, int]
+Value = TypeVar("Value")
 
 SAME_CLOCK = 3600.0
 SILENT = 3.0
 MOST = 50
 """Silent spans of a source that are kept, the longest."""
+HELD = 20_000
+"""Receptions remembered until the log of their step comes."""
 BINS = 40
 SHOWING_EVERY = 8
 """Messages between calls of `progress`."""
@@ -261,17 +265,19 @@ class Logbook:
             spread = np.sqrt(message.covariances[:, at, at].mean(axis=1))
         if len(spread) and np.isfinite(typical := float(np.median(spread))):
             self._spreads[kind].append(typical)
-        if received is not None:
+        live = message.origin != "replay"
+        if live and received is not None:
             self._delay("bus", name, received - message.sent)
-        self._delay("source" if kind == "local" else "centre", name, message.sent - message.time)
+        if live:
+            self._delay("source" if kind == "local" else "centre", name, message.sent - message.time)
         if isinstance(message, GlobalTracks):
             self._note_picture(message)
-            if received is not None:
+            if live and received is not None:
                 self._react((name, message.epoch, message.step), picture=received)
         else:
             self._spaces.setdefault(name, set()).add((message.space, message.frame))
             if received is not None:
-                self._came[name, message.epoch, message.seq] = received
+                _remember(self._came, (name, message.epoch, message.seq), received)
 
     def _note_picture(self, message: GlobalTracks) -> None:
         account = self.accounts.setdefault(message.source, Account())
@@ -305,7 +311,7 @@ class Logbook:
             n, total = account.innovation.get(source, (0, 0.0))
             account.innovation[source] = n + len(value), total + float(value.sum())
         if received is not None:
-            came = [self._came.pop((one.source, one.epoch, one.seq), None) for one in message.taken]
+            came = [self._came.get((one.source, one.epoch, one.seq)) for one in message.taken]
             newest = max((time for time in came if time is not None), default=None)
             if newest is not None:
                 self._react((message.source, message.epoch, message.step), taken=newest)
@@ -314,7 +320,7 @@ class Logbook:
         """Picture and log of a step come one after the other, in either order."""
         other = self._taken.pop(step, None)
         if other is None:
-            self._taken[step] = picture, taken
+            _remember(self._taken, step, (picture, taken))
             return
         picture, taken = picture or other[0], taken or other[1]
         if picture is not None and taken is not None:
@@ -334,9 +340,16 @@ class Logbook:
             _fill(self.traffic[kind, name], time, epoch, seq, period)
         for key, delays in self._delays.items():
             values = np.frombuffer(delays, dtype=np.float64)
-            if key[0] not in ("source", "centre") or abs(float(np.median(values))) < SAME_CLOCK:
+            if abs(float(np.median(values))) < SAME_CLOCK:
                 self.latency[key] = _latency(values)
         self._delays, self._came, self._taken = {}, {}, {}
+
+
+def _remember(known: dict[Step, Value], step: Step, value: Value) -> None:
+    """The newest so many; what has waited longest for what belongs to it is forgotten."""
+    known[step] = value
+    if len(known) > HELD:
+        del known[next(iter(known))]
 
 
 def _fill(traffic: Traffic, time: Times, epoch: NDArray[np.uint64], seq: Times, period: float | None) -> None:

@@ -121,7 +121,8 @@ def _rules(rows: Sequence[Row]) -> str:
     head, *lines = rules_table(rows)
     best = best_rows(rows)
     marks = {(index, k): "best" for k, name in enumerate(head) for index in best.get(name, ())}
-    note = '<p class="note">The best of each column is marked (ANEES: nearest to 1). GOSPA, OSPA, RMSE in m; 2+: targets that several sources track.</p>'
+    text = "The best of each column is marked (ANEES: nearest to 1). GOSPA, OSPA, RMSE in m; 2+: targets that several"
+    note = f'<p class="note">{text} sources track.</p>'
     return _table(head, lines, marks, left=len(head) - NUMBERS) + note
 
 

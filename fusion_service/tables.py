@@ -180,9 +180,8 @@ RULES = (
     "switches",
     "complete",
 )
-"""Columns of the table of rules ("RMSE, 2+": of targets that two sources or more track); of the numbers the lower is the better, ANEES by its distance from 1, but of followed
-and complete the higher."""
-
+"""Columns of the table of rules ("RMSE, 2+": of targets that two sources or more track). Of the numbers the lower is
+the better, ANEES by its distance from 1, but of followed and complete the higher."""
 NUMBERS = len(RULES) - 3
 """Of its columns the last ones."""
 
