@@ -2,7 +2,7 @@
 
 * A message's place is (time, kind, source, epoch, seq, arrival). `Logbook.tracks` gives tracks in this order; of a
   recording it holds back only what came before its turn, as bytes.
-* Latency, of what is no replay: "bus", from `sent` to the recorder's `received`; "source" and "centre", from the time of
+* Delays, not of a replay: "bus", from `sent` to the recorder's `received`; "source" and "centre", from the time of
   the tracks to `sent`; "reaction", from the reception of the last message that a step took to that of its picture. Each
   where most messages show less than `SAME_CLOCK`: a mission played at another time or pace has its own clock.
 * A sequence number of an epoch that is missing between the first and the last is a gap; a source that says nothing for
