@@ -179,10 +179,15 @@ def assess(
 ) -> Assessment:
     """Everything that can be said of a mission. centres: which ones, all by default, each scored at the times of the
     pictures of all. truths: in place of the mission's own. progress: called with the share that is done. rows: about
-    how many tracks of each source `sample` is to hold. Raises `NothingToScoreError` where there are no tracks."""
+    how many tracks of each source `sample` is to hold. Without a centre: in the frame of the first source, each
+    interval of the fastest. Raises `NothingToScoreError` where there are no tracks."""
     chosen = c is None
     names = list(centres) or book.centres
-    ground = _ground(book, names, None, None, motion, c or book.cutoff(SPREADS))
+    frame, space = (book.ground() if not names else None) or (None, None)
+    if not names:
+        intervals = [book.traffic["local", name].interval for name in book.sources]
+        every = every or min((interval for interval in intervals if interval > 0), default=1.0)
+    ground = _ground(book, names, frame, space, motion, c or book.cutoff(SPREADS))
     at = book.times(names) if names else None
     try:
         scored, unscored = _truth(truths or book.truths, ground, at, every, gap), None
@@ -379,9 +384,8 @@ class _Score:
         unknown = there[(self._begins[there] < 0) & ~known[there]]
         if len(unknown):
             where = self._truth.states[k, unknown, : places.shape[1]].T
-            for name in self._ground.sources:
-                if (info := self._infos.get(name)) is not None:
-                    known[unknown] |= covers(info, where, self._ground.frame)
+            for info in self._infos.values():
+                known[unknown] |= covers(info, where, self._ground.frame)
         self._begins[(self._begins < 0) & known] = k
         for name, confirmed in self._confirmed.items():
             confirmed[(confirmed < 0) & self._tallies["global", name].assigned(k)] = k

@@ -23,7 +23,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.geodesy import FrameError, transform
-from schemas import Frame, GlobalTracks, LocalTracks, Message, MessageError, SensorInfo, Status, StepLog, Truth, decode
+from schemas import (
+    Frame,
+    GlobalTracks,
+    LocalIntensity,
+    LocalTracks,
+    Message,
+    MessageError,
+    SensorInfo,
+    Status,
+    StepLog,
+    Truth,
+    decode,
+)
 from schemas.messages import BROKEN, CONFIRMED, GATE_FAILED, KEPT
 
 __all__ = ["Account", "Latency", "Logbook", "Silence", "Traffic"]
@@ -108,8 +120,8 @@ class Account:
 class Logbook:
     """One mission. `Logbook(messages)` of what is in memory, `Logbook.read(path)` of a recording.
 
-    truths; infos: newest of each source; accounts: by centre; traffic: by ("local" or "global", name); latency: by
-    (kind, name); bad: messages that do not decode, by reason; counts: messages by type.
+    truths; infos: newest of each source; accounts: by centre; traffic: by ("local", "intensity" or "global", name);
+    latency: by (kind, name); bad: messages that do not decode, by reason; counts: messages by type.
     """
 
     def __init__(self, messages: Iterable[Message] = ()) -> None:
@@ -207,6 +219,13 @@ class Logbook:
                 return f"its tracks have no z (their space: {' '.join(space)})"
         return None
 
+    def ground(self) -> tuple[Frame, tuple[str, ...]] | None:
+        """The frame and space of the first source in the alphabet; None without tracks of a source."""
+        for name in self.sources:
+            space, frame = min(self._spaces[name], key=repr)
+            return frame, space
+        return None
+
     @property
     def sources(self) -> list[str]:
         """Names of the sources of tracks, sorted."""
@@ -243,6 +262,8 @@ class Logbook:
         elif isinstance(message, SensorInfo):
             known = self.infos.get(name, message)
             self.infos[name] = max(known, message, key=lambda info: (info.epoch, info.seq))
+        elif isinstance(message, LocalIntensity):
+            self._note_traffic("intensity", message, len(message.weights), arrival, received)
         elif isinstance(message, LocalTracks | GlobalTracks):
             self._note_tracks(message, arrival, received)
         elif isinstance(message, StepLog):
@@ -252,32 +273,37 @@ class Logbook:
             known_status = account.status or message
             account.status = max(known_status, message, key=lambda one: (one.epoch, one.seq))
 
-    def _note_tracks(self, message: Tracks, arrival: int, received: int | None) -> None:
-        kind, name = "local" if isinstance(message, LocalTracks) else "global", message.source
+    def _note_traffic(
+        self, kind: str, message: Tracks | LocalIntensity, size: int, arrival: int, received: int | None
+    ) -> None:
+        name = message.source
         actor = self._actors.setdefault((kind, name), len(self._actors))
         place = {"actor": actor, "time": message.time, "epoch": message.epoch, "seq": message.seq, "arrival": arrival}
         for column, value in place.items():
             self._columns[column].append(value)
-        self.traffic.setdefault((kind, name), Traffic()).tracks += len(message.ids)
+        self.traffic.setdefault((kind, name), Traffic()).tracks += size
         self.origins[message.origin] += 1
+        if message.origin != "replay":
+            self._delay("centre" if kind == "global" else "source", name, message.sent - message.time)
+            if received is not None:
+                self._delay("bus", name, received - message.sent)
+        if received is not None and kind != "global":
+            _remember(self._came, (name, message.epoch, message.seq), received)
+
+    def _note_tracks(self, message: Tracks, arrival: int, received: int | None) -> None:
+        kind, name = "local" if isinstance(message, LocalTracks) else "global", message.source
+        self._note_traffic(kind, message, len(message.ids), arrival, received)
         at = [message.space.index(axis) for axis in "xyz" if axis in message.space]
         with np.errstate(all="ignore"):
             spread = np.sqrt(message.covariances[:, at, at].mean(axis=1))
         if len(spread) and np.isfinite(typical := float(np.median(spread))):
             self._spreads[kind].append(typical)
-        live = message.origin != "replay"
-        if live and received is not None:
-            self._delay("bus", name, received - message.sent)
-        if live:
-            self._delay("source" if kind == "local" else "centre", name, message.sent - message.time)
         if isinstance(message, GlobalTracks):
             self._note_picture(message)
-            if live and received is not None:
+            if received is not None and message.origin != "replay":
                 self._react((name, message.epoch, message.step), picture=received)
         else:
             self._spaces.setdefault(name, set()).add((message.space, message.frame))
-            if received is not None:
-                _remember(self._came, (name, message.epoch, message.seq), received)
 
     def _note_picture(self, message: GlobalTracks) -> None:
         account = self.accounts.setdefault(message.source, Account())
@@ -334,7 +360,7 @@ class Logbook:
         columns = {name: np.frombuffer(column, dtype=column.typecode) for name, column in self._columns.items()}
         for (kind, name), actor in self._actors.items():
             mine = np.flatnonzero(columns["actor"] == actor)
-            info = self.infos.get(name) if kind == "local" else None
+            info = self.infos.get(name) if kind != "global" else None
             period = info.period if info else None
             time, epoch, seq = (columns[one][mine] for one in ("time", "epoch", "seq"))
             _fill(self.traffic[kind, name], time, epoch, seq, period)

@@ -24,6 +24,7 @@ from fusion_service.tables import (
     confirm_line,
     digits,
     fixed,
+    links,
     pair_words,
     percent,
     row_name,
@@ -146,7 +147,11 @@ def _map(one: Assessment) -> list[str]:
 def _against_truth(rows: Sequence[Row]) -> list[str]:
     """Of the rows of one recording."""
     evaluation = rows[0].evaluation
-    fused = {f"fused ({row_name(row, rows) if len(rows) > 1 else row.rule})": row.evaluation for row in rows}
+    fused = {
+        f"fused ({row_name(row, rows) if len(rows) > 1 else row.rule})": row.evaluation
+        for row in rows
+        if row.evaluation.centre
+    }
     scored = {**evaluation.sources, **{name: one.fused for name, one in fused.items()}}
     lines = [
         [
@@ -178,7 +183,7 @@ def _against_truth(rows: Sequence[Row]) -> list[str]:
     )
     found = [f'<p class="note">{escape(about)}</p>', _table(head, lines, marks)]
     found += [f"<p>Not scored: {escape(name)}: {escape(why)}</p>" for name, why in evaluation.left_out.items()]
-    if evaluation.seen.max(initial=0) > 1:
+    if evaluation.seen.max(initial=0) > 1 and fused:
         shared = [
             [
                 name if len(rows) > 1 else kind.replace("_", " "),
@@ -230,12 +235,7 @@ def _without_truth(one: Assessment, which: str) -> list[str]:
             found.append(f"<h3>How many sources feed a confirmed track{escape(of)}</h3>")
             shares = [["share", *(percent(count / shown) for _, count in parts)]]
             found.append(_table(["sources", *(n for n, _ in parts)], shares))
-        if account.innovation:
-            lines = []
-            for source, (n, total) in sorted(account.innovation.items()):
-                mean = total / n / account.dimension if n and account.dimension else float("nan")
-                counts = (account.kept[source], account.failed[source], account.broken[source])
-                lines.append([source, *map(str, counts), fixed(mean)])
+        if lines := links(account):
             found.append(f"<h3>Links against the fusion of the others{escape(of)}</h3>")
             found.append(_table(("", "kept", "failed a gate", "cut", "mean d² / n"), lines))
         refusals = [
@@ -306,7 +306,7 @@ def _gaps(one: Assessment) -> str:
         longest = traffic.silences[0] if traffic.silences else None
         lines.append(
             [
-                name if kind == "local" else f"{name} (centre)",
+                f"{name} (centre)" if kind == "global" else name,
                 str(traffic.messages),
                 f"{traffic.interval:.3g}",
                 str(traffic.epochs),

@@ -51,49 +51,63 @@ STYLE: Any = {
 
 def charts(rows: Sequence[Row]) -> list[tuple[str, str]]:
     """(SVG, what it shows and how to read it) of scored rows, which must not be none: of one row with its sources, of
-    several beside each other."""
+    several beside each other. Without a centre: of its sources alone."""
     first = rows[0]
     lines = _lines(rows)
+    if not lines:
+        return []
+    fused = first.evaluation.centre is not None
     beside = "the fused tracks of each row" if len(rows) > 1 else "each source and the fused tracks"
-    found = [
-        (
-            _chart(lambda axes: _parts(axes, first), f"GOSPA², its parts{_of(rows)}"),
+    found = []
+
+    def put(draw: Callable[[Axes], None], title: str, text: str) -> None:
+        found.append((_chart(draw, title), text))
+
+    if fused:
+        put(
+            lambda axes: _parts(axes, first),
+            f"GOSPA², its parts{_of(rows)}",
             "Its parts: errors of position, targets missed, false tracks. The tallest layer is what to mend.",
-        ),
-        (
-            _chart(lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"), "GOSPA over time"),
-            f"All faults in one number for {beside}. Lower is better.",
-        ),
-        (
-            _chart(lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"), "Error of position over time"),
-            "Only of targets that are followed at that time: a source that follows only easy ones looks good here.",
-        ),
-        (
-            _chart(lambda axes: _nees(axes, lines), "Consistency: ANEES over time"),
-            "1 is ideal. Above the band the covariances are too small (overconfident), below it too large (cautious).",
-        ),
-        (
-            _chart(lambda axes: _cardinality(axes, rows), "How many there are"),
+        )
+    put(
+        lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"),
+        "GOSPA over time",
+        f"All faults in one number for {beside}. Lower is better.",
+    )
+    put(
+        lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"),
+        "Error of position over time",
+        "Only of targets that are followed at that time: a source that follows only easy ones looks good here.",
+    )
+    put(
+        lambda axes: _nees(axes, lines),
+        "Consistency: ANEES over time",
+        "1 is ideal. Above the band the covariances are too small (overconfident), below it too large (cautious).",
+    )
+    if fused:
+        put(
+            lambda axes: _cardinality(axes, rows),
+            "How many there are",
             "Targets that exist, and fused tracks that are shown. Shown below true: missed; above: false or double. "
             "Expected: the sum of existence probabilities, tentative tracks included.",
-        ),
-        (
-            _chart(lambda axes: _siap(axes, first), f"SIAP of the fused tracks{_of(rows)}"),
+        )
+        put(
+            lambda axes: _siap(axes, first),
+            f"SIAP of the fused tracks{_of(rows)}",
             "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per followed "
             "target: 1 is ideal.",
-        ),
-        (
-            _chart(lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"), "OSPA(2): tracks, not points"),
-            f"Compares whole tracks over {WINDOW} scored times: a track that changes its target or breaks costs too. "
-            "Lower is better.",
-        ),
-    ]
+        )
+    put(
+        lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"),
+        "OSPA(2): tracks, not points",
+        f"Compares whole tracks over {WINDOW} scored times: a track that changes its target or breaks costs too. "
+        "Lower is better.",
+    )
     if any(np.isfinite(row.evaluation.confirm).any() for row in rows):
-        found.append(
-            (
-                _chart(lambda axes: _confirm(axes, rows), "Time to confirm"),
-                "Share of the targets that a source covered or tracked which had a fused track after so many seconds.",
-            )
+        put(
+            lambda axes: _confirm(axes, rows),
+            "Time to confirm",
+            "Share of the targets that a source covered or tracked which had a fused track after so many seconds.",
         )
     return found
 
@@ -125,6 +139,8 @@ def _lines(rows: Sequence[Row]) -> list[tuple[str, str, float, Scores, Floats]]:
         colours = source_colours(first.sources)
         seconds = _seconds(first.times)
         lines = [(name, colours[name], 1.2, scores, seconds) for name, scores in first.sources.items()]
+        if first.centre is None:
+            return lines
         return [*lines, (f"fused, {rows[0].rule}", FUSED, 2.0, first.fused, seconds)]
     palette = (FUSED, *SOURCES)
     return [

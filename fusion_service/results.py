@@ -55,7 +55,11 @@ def facts(assessment: Assessment) -> dict[str, str]:
     """The mission in a few lines."""
     book = assessment.book
     span = book.span
-    sources = [f"{name} ({book.traffic['local', name].tracks} tracks)" for name in book.sources]
+    sources = [
+        f"{name} ({one.tracks} {'tracks' if kind == 'local' else 'components'})"
+        for (kind, name), one in sorted(book.traffic.items())
+        if kind != "global"
+    ]
     centres = [
         f"{name}: {rule_of(assessment, name)}, {book.traffic['global', name].messages} pictures"
         + (f", {len(book.accounts[name].runs)} runs" if len(book.accounts[name].runs) > 1 else "")
@@ -93,7 +97,7 @@ def text(assessments: Sequence[Assessment]) -> str:
             evaluation = one.evaluations[centre]
             if len(one.evaluations) > 1:
                 lines.append(f"of {centre} (--centre NAME shows another, --html and --json all of them):")
-            scored = {**evaluation.sources, "fused": evaluation.fused}
+            scored = {**evaluation.sources, **({"fused": evaluation.fused} if evaluation.centre else {})}
             lines += [format_table(evaluation), ""]
             lines += [*aligned(tracking_table(scored, len(evaluation.targets))), confirm_line(evaluation)]
         lines += ["", *truthless_lines(one, centre)]

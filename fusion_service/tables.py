@@ -26,6 +26,7 @@ __all__ = [
     "digits",
     "fixed",
     "format_table",
+    "links",
     "metres",
     "pair_words",
     "percent",
@@ -97,18 +98,27 @@ class Row(NamedTuple):
 def sentence(row: Row) -> str:
     """How it went, in words."""
     evaluation, fused = row.evaluation, row.evaluation.fused
+    if evaluation.centre is None:
+        best = max(evaluation.sources.items(), key=lambda item: item[1].followed, default=None)
+        if best is None:
+            return "No fused tracks, and no source that could be scored."
+        name, one = best
+        text = [f"No fused tracks; {name} followed most targets, {one.followed} of {len(evaluation.targets)}"]
+        if np.isfinite(one.rmse_position):
+            text += [f"RMSE {metres(one.rmse_position)}", consistent(one.anees, one.bounds)]
+        return "; ".join(text) + "."
     shared = evaluation.shared["seen_by_2_or_more"]
     text = [f"Fused tracks ({row.rule}) followed {fused.followed} of {len(evaluation.targets)} targets"]
     if np.isfinite(fused.rmse_position):
         text.append(f"RMSE {metres(fused.rmse_position)}")
-        best = min((one.rmse_position for one in evaluation.sources.values()), default=np.nan)
+        least = min((one.rmse_position for one in evaluation.sources.values()), default=np.nan)
         if shared["pairs"] and np.isfinite(shared["best_rmse"]):
             text.append(
                 f"where several sources see a target {metres(shared['fused_rmse'])}, "
                 f"{_against(shared['fused_rmse'], shared['best_rmse'])} the best of them"
             )
-        elif np.isfinite(best):
-            text.append(f"{_against(fused.rmse_position, best)} the best source on its own targets")
+        elif np.isfinite(least):
+            text.append(f"{_against(fused.rmse_position, least)} the best source on its own targets")
         text.append(consistent(fused.anees, fused.bounds))
     return "; ".join(text) + "."
 
@@ -321,18 +331,24 @@ def pair_words(pair: Pair) -> str:
     return "as said"
 
 
+def links(account: Account) -> list[list[str]]:
+    """By source with links: kept, failed a gate, cut, and the mean of d2 / n against the fusion of the others."""
+    lines = []
+    for name, (n, total) in sorted(account.innovation.items()):
+        counts = (account.kept[name], account.failed[name], account.broken[name])
+        mean = total / n / account.dimension if n and account.dimension else float("nan")
+        if any(counts):
+            lines.append([name, *map(str, counts), fixed(mean)])
+    return lines
+
+
 def _account_lines(account: Account) -> list[str]:
     lines = []
     shown = sum(account.shown.values())
     if shown:
         parts = [f"{percent(count / shown)} by {_sources(n)}" for n, count in sorted(account.shown.items())]
         lines.append(f"Confirmed tracks are fed: {', '.join(parts)}.")
-    table = [["links of", "kept", "failed a gate", "cut", "mean d2 / n"]]
-    for name in sorted(account.innovation):
-        n, total = account.innovation[name]
-        mean = total / n / account.dimension if n and account.dimension else float("nan")
-        counts = (account.kept[name], account.failed[name], account.broken[name])
-        table.append([name, *map(str, counts), fixed(mean)])
+    table = [["links of", "kept", "failed a gate", "cut", "mean d2 / n"], *links(account)]
     if len(table) > 1:
         lines += ["", "Each source against the fusion of the others (equal weights, cautious: below 1 is usual):"]
         lines += [*aligned(table), ""]

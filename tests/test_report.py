@@ -151,5 +151,11 @@ def test_without_truth_and_without_tracks_of_a_centre(flown: list[Message]) -> N
     assert "Sources against each other" in page.headings
     assert "Map" in page.headings
     one = [message for message in blind if message.source != "main"]
+    page = Page(report([assess(Logbook(one), rows=500)]))
+    assert "Gaps" in page.headings
+    alone = [message for message in flown if message.source != "main"]
+    page = Page(report([assess(Logbook(alone), c=300.0, rows=500)]))
+    assert {"Against the truth", "Over time"} <= set(page.headings)
+    assert not any(row and row[0].startswith("fused") for row in page.rows)
     with pytest.raises(ValueError, match="no global tracks"):
-        assess(Logbook(one))
+        assess(Logbook([]))
