@@ -94,8 +94,8 @@ def charts(rows: Sequence[Row]) -> list[tuple[str, str]]:
         put(
             lambda axes: _siap(axes, first),
             f"SIAP of the fused tracks{_of(rows)}",
-            "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per followed "
-            "target: 1 is ideal.",
+            "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per "
+            "target that has one: 1 is ideal.",
         )
     put(
         lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"),
@@ -218,7 +218,7 @@ def _siap(axes: Axes, row: Row) -> None:
     for name, label, colour in (
         ("completeness", "complete", "#009e73"),
         ("spuriousness", "spurious", "#d55e00"),
-        ("ambiguity", "tracks per followed target", "#0072b2"),
+        ("ambiguity", "tracks per target", "#0072b2"),
     ):
         axes.plot(*_thin(seconds, getattr(series, name)), color=colour, label=label)
     axes.set(xlabel="s since the first scored time", ylabel="share, number", ylim=(-0.03, None))

@@ -40,7 +40,7 @@ dl.words dd{margin:0;max-width:75ch}
 .swatch{display:inline-block;width:1em;height:1em;vertical-align:-.12em;margin:0 .3em 0 .8em;border:1px solid #c5ccd3}
 @media (max-width:600px){body{padding:.8rem .8rem 3rem;font-size:15px}dl.facts{grid-template-columns:1fr}
 dl.facts dd{margin-bottom:.4rem}th,td{padding:.25rem .45rem}}
-@media print{body{max-width:none;padding:0;font-size:10.5pt}h2{break-after:avoid}table,figure{break-inside:avoid}
+@media print{body{max-width:none;padding:0;font-size:10.5pt}h2,h3,dt{break-after:avoid}table,figure{break-inside:avoid}
 .scroll{overflow:visible}table{font-size:8pt}th,td{padding:.15rem .35rem}.map img{min-width:0}
 .charts{grid-template-columns:1fr 1fr;gap:.8rem}*{-webkit-print-color-adjust:exact;print-color-adjust:exact}}
 """

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import threading
 from collections.abc import Iterable
 from dataclasses import replace
@@ -257,3 +258,19 @@ def test_agreement_grows_with_a_bias(said: list[Sent]) -> None:
     assert pairs["radar1", "radar3"].mean > 2 * pairs["radar1", "radar3"].bounds[1]
     low, high = pairs["radar2", "radar3"].bounds
     assert low < pairs["radar2", "radar3"].mean < high
+
+
+@pytest.mark.parametrize(("module", "extra"), [("rerun", "record"), ("matplotlib", "report")])
+def test_an_extra_that_is_missing_is_named(
+    flown: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    module: str,
+    extra: str,
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    assert main(["evaluate", str(flown), "--html", str(tmp_path / "page.html")]) == 1
+    error = capsys.readouterr().err
+    assert f"track-fusion-centre[{extra}]" in error
+    assert error.count("\n") == 1

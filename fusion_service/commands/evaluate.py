@@ -39,7 +39,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--cutoff", type=_positive, metavar="M", help="largest error that still counts as followed, m (default: chosen)"
     )
     parser.add_argument("--every", type=_positive, metavar="S", help="score so often, s (default: at each step)")
-    parser.add_argument("--centre", metavar="NAME", nargs="+", help="these centres only (default: all)")
+    parser.add_argument("--centre", metavar="NAME", action="append", help="only this centre; may be repeated")
     parser.add_argument("--json", metavar="FILE", help="write every number here")
     parser.add_argument("--html", metavar="FILE", help="write a page for people here")
 
@@ -52,6 +52,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     for page in pages:
         if page.is_dir() or not page.parent.is_dir():
             raise ReviewError(f"cannot write {page}: name a file in a folder that exists")
+    _need_rerun()
     if args.html:
         from fusion_service.report import need_matplotlib
 
@@ -81,6 +82,15 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
 
         Path(args.html).write_text(report(done), encoding="utf-8")
         print(f"page:   {args.html}")
+
+
+def _need_rerun() -> None:
+    from fusion_service.recording.columns import import_rerun
+
+    try:
+        import_rerun()
+    except ImportError as error:
+        raise ReviewError(str(error)) from None
 
 
 def _assess(
