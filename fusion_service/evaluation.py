@@ -47,6 +47,7 @@ Tracks = LocalTracks | GlobalTracks
 
 BLOCK = 32
 """Times scored at once."""
+MOST_TIMES = 5_000_000
 SPREADS = 10.0
 """Without a given cut-off: so many standard deviations of the fused position, rounded up to 1, 2 or 5 times 10^n."""
 
@@ -193,6 +194,8 @@ def assess(
         scored, unscored = _truth(truths or book.truths, ground, at, every, gap), None
     except ValueError as error:
         scored, unscored = None, str(error)
+    if truths and not scored:
+        raise NothingToScoreError(f"the given truth does not go with this mission: {unscored}")
     times = scored.times if scored else _all_times(book, at, every)
     found, agreements, sample = _walk(book, ground, scored, times, progress, rows)
     if rows and scored:
@@ -284,6 +287,7 @@ def _truth(truths: Sequence[Truth], ground: _Ground, pictures: Times | None, eve
             "no time to score: no picture of the centre, or no multiple of every, while there is truth"
         )
     states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
+    states[~np.isfinite(states[:, :, : len(ground.axes)]).all(axis=2)] = np.nan
     return _Truth(times, tuple(paths), states)
 
 
@@ -295,6 +299,11 @@ def _all_times(book: Logbook, pictures: Times | None, every: float | None) -> Ti
 
 def _multiples(first: int, last: int, every: float) -> Times:
     step = max(round(every * 1e9), 1)
+    if (count := (last - first) // step) > MOST_TIMES:
+        raise NothingToScoreError(
+            f"{count} times every {every:g} s: a clock is wrong, or every (--every) is too short, for a mission of "
+            f"{(last - first) / 1e9:.4g} s"
+        )
     return np.arange(-(-first // step), last // step + 1, dtype=np.int64) * step
 
 

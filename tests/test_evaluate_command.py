@@ -231,6 +231,11 @@ def test_what_cannot_be_evaluated_is_told_in_one_line(
         error = capsys.readouterr().err
         assert says in error
         assert error.count("\n") == 1
+    old = tmp_path / "old.csv"
+    lines = none.read_text() + short.read_text().splitlines()[2].replace(str(START), "1000") + "\n"
+    old.write_text(lines)
+    assert main(["evaluate", str(flown), "--truth", str(old)]) == 1
+    assert "the given truth does not go with this mission: no time to score" in capsys.readouterr().err
     for wrong in ("0", "-3", "nan", "far"):
         with pytest.raises(SystemExit) as caught:
             main(["evaluate", str(flown), "--cutoff", wrong])

@@ -330,6 +330,19 @@ def test_nothing_to_score(mission: list[Message], says: str) -> None:
         evaluate(mission, c=10.0, every=None)
 
 
+def test_a_wrong_clock_does_not_ask_for_a_billion_times() -> None:
+    far = [truth(0, [1], STILL), truth(1e9, [1], STILL), picture(0, [1], STILL)]
+    with pytest.raises(ValueError, match=r"1000000000 times every 1 s: a clock is wrong, or every"):
+        evaluate(far, c=10.0, every=1.0)
+
+
+def test_truth_that_is_no_number_is_no_target() -> None:
+    mission = still(3)
+    broken = truth(2, [2], [], means=np.array([[0.0, 0.0, np.nan, 0.0]]))
+    result = evaluate([*mission, broken], c=10.0, every=None)
+    assert result.exists.tolist() == [[True, False]] * 4
+
+
 def test_one_of_several_centres() -> None:
     other = [picture(t, [1], [[3.0, 0.0]], centre="other") for t in range(4)]
     assert evaluate([*still(3), *other], c=10.0, every=None, centre="other").fused.rmse_position == pytest.approx(3.0)

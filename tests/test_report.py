@@ -130,7 +130,7 @@ def test_it_says_the_numbers(text: str, assessed: Assessment) -> None:
 
 def test_rules_stand_beside_each_other_with_the_best_marked(flown: list[Message]) -> None:
     pictures = [message for message in flown if isinstance(message, GlobalTracks)]
-    other = [centre(message, "far & <off>", "naive", 60.0) for message in pictures]
+    other = [centre(message, "far & <off>", '$x_{"<b>', 60.0) for message in pictures]
     page = Page(report([assess(Logbook([*flown, *other]), c=300.0, rows=500)]))
     head = next(row for row in page.rows if "RMSE" in row)
     at = page.rows.index(head)
