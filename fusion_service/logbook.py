@@ -283,7 +283,7 @@ class Logbook:
             self._columns[column].append(value)
         self.traffic.setdefault((kind, name), Traffic()).tracks += size
         self.origins[message.origin] += 1
-        if message.origin != "replay":
+        if _by_a_clock(message):
             self._delay("centre" if kind == "global" else "source", name, message.sent - message.time)
             if received is not None:
                 self._delay("bus", name, received - message.sent)
@@ -300,7 +300,7 @@ class Logbook:
             self._spreads[kind].append(typical)
         if isinstance(message, GlobalTracks):
             self._note_picture(message)
-            if received is not None and message.origin != "replay":
+            if received is not None and _by_a_clock(message):
                 self._react((name, message.epoch, message.step), picture=received)
         else:
             self._spaces.setdefault(name, set()).add((message.space, message.frame))
@@ -369,6 +369,11 @@ class Logbook:
             if abs(float(np.median(values))) < SAME_CLOCK:
                 self.latency[key] = _latency(values)
         self._delays, self._came, self._taken = {}, {}, {}
+
+
+def _by_a_clock(message: Tracks | LocalIntensity) -> bool:
+    """Whether `sent` is of a clock: a centre that only replays a mission has none, and says the time of the step."""
+    return not (isinstance(message, GlobalTracks) and message.sent == message.time)
 
 
 def _remember(known: dict[Step, Value], step: Step, value: Value) -> None:
