@@ -18,8 +18,8 @@ from recording.mission import START, Sent, mission
 from fusion_service.cli import main
 from fusion_service.commands import evaluate as command
 from fusion_service.evaluation import assess, evaluate
+from fusion_service.evaluation.logbook import Logbook
 from fusion_service.export import export
-from fusion_service.logbook import Logbook
 from fusion_service.recording import Recorder, messages
 from schemas import Entry, GlobalTracks, StepLog, Truth, global_key
 

@@ -45,8 +45,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    from fusion_service.results import results, text
-    from fusion_service.truth import read_truth
+    from fusion_service.evaluation.results import results, text
+    from fusion_service.evaluation.truth import read_truth
 
     pages = [Path(name) for name in (args.json, args.html) if name]
     for page in pages:
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             raise ReviewError(f"cannot write {page}: name a file in a folder that exists")
     _need_rerun()
     if args.html:
-        from fusion_service.report import need_matplotlib
+        from fusion_service.evaluation.report import need_matplotlib
 
         need_matplotlib()
     done: list[Assessment] = []
@@ -78,7 +78,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         Path(args.json).write_text(json.dumps(results(done), allow_nan=False) + "\n", encoding="utf-8")
         print(f"scores: {args.json}")
     if args.html:
-        from fusion_service.report import report
+        from fusion_service.evaluation.report import report
 
         Path(args.html).write_text(report(done), encoding="utf-8")
         print(f"page:   {args.html}")
@@ -97,7 +97,7 @@ def _assess(
     path: Path, truths: list[Truth], cutoff: float | None, args: argparse.Namespace, stop: threading.Event
 ) -> Assessment:
     from fusion_service.evaluation import assess
-    from fusion_service.logbook import Logbook
+    from fusion_service.evaluation.logbook import Logbook
 
     with Progress(path.name) as bar:
         size = max(path.stat().st_size, 1) if path.is_file() else 1

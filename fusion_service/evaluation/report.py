@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from fusion_service.errors import ReviewError
-from fusion_service.evaluation import Assessment
-from fusion_service.report_text import CSS, WORDS
-from fusion_service.results import facts, label, rows_of, rule_of, utc
-from fusion_service.tables import (
+from fusion_service.evaluation.assess import Assessment
+from fusion_service.evaluation.report_text import CSS, WORDS
+from fusion_service.evaluation.results import facts, label, rows_of, rule_of, utc
+from fusion_service.evaluation.tables import (
     DELAYS,
     NUMBERS,
     Row,
@@ -49,7 +49,7 @@ def need_matplotlib() -> None:
 
 def report(assessments: Sequence[Assessment]) -> str:
     """The page about missions, of which there must be one."""
-    from fusion_service.report_charts import charts
+    from fusion_service.evaluation.report_charts import charts
 
     rows = rows_of(assessments)
     title = ", ".join(dict.fromkeys(label(one) or "mission" for one in assessments))
@@ -218,8 +218,8 @@ def _mark(value: float, bounds: tuple[float, float]) -> str:
 
 
 def _without_truth(one: Assessment, which: str) -> list[str]:
+    from fusion_service.evaluation.report_charts import delay_chart
     from fusion_service.picture import source_colours
-    from fusion_service.report_charts import delay_chart
 
     book = one.book
     colours = source_colours([*book.sources, *book.infos])

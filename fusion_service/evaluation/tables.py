@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
-    from fusion_service.consistency import Pair
-    from fusion_service.evaluation import Assessment, Evaluation
-    from fusion_service.logbook import Account
-    from fusion_service.scoring import Scores
+    from fusion_service.evaluation.assess import Assessment, Evaluation
+    from fusion_service.evaluation.consistency import Pair
+    from fusion_service.evaluation.logbook import Account
+    from fusion_service.evaluation.scoring import Scores
 
 __all__ = [
     "DELAYS",

@@ -29,17 +29,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from fusion_service.consistency import Agreement, Consistency
 from fusion_service.coverage import covers
 from fusion_service.errors import ReviewError
-from fusion_service.logbook import Logbook
+from fusion_service.evaluation.consistency import Agreement, Consistency
+from fusion_service.evaluation.logbook import Logbook
+from fusion_service.evaluation.scoring import Scores, Tally, averages, bounds, plain
 from fusion_service.metrics import DENSE
-from fusion_service.scoring import METRICS, Scores, Tally, averages, bounds, plain
 from fusion_service.snapshots import STALE_PERIODS, STALE_STEPS, Block, Follower, truth_path, truth_positions
-from fusion_service.tables import format_table
 from schemas import Frame, GlobalTracks, LocalTracks, Message, Motion, Truth
 
-__all__ = ["METRICS", "Assessment", "Evaluation", "NothingToScoreError", "Scores", "assess", "evaluate", "format_table"]
+__all__ = ["Assessment", "Evaluation", "NothingToScoreError", "assess", "evaluate"]
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]

@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.logbook import BINS
+from fusion_service.evaluation.logbook import BINS
+from fusion_service.evaluation.scoring import WINDOW, Scores
+from fusion_service.evaluation.tables import Row, row_name
 from fusion_service.picture import FUSED, SOURCES, source_colours
-from fusion_service.scoring import WINDOW, Scores
-from fusion_service.tables import Row, row_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from fusion_service.logbook import Latency
+    from fusion_service.evaluation.logbook import Latency
 
 __all__ = ["charts", "delay_chart"]
 

@@ -7,9 +7,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from fusion_service.evaluation import Assessment
-from fusion_service.scoring import plain
-from fusion_service.tables import (
+from fusion_service.evaluation.assess import Assessment
+from fusion_service.evaluation.scoring import plain
+from fusion_service.evaluation.tables import (
     NUMBERS,
     Row,
     aligned,

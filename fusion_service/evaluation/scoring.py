@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
-from fusion_service.continuity import Following, Moment, Siap, ospa2, siap_of
+from fusion_service.evaluation.continuity import Following, Moment, Siap, ospa2, siap_of
 from fusion_service.metrics import DENSE, assign_near, near_pairs, nees, nees_bounds
 from fusion_service.snapshots import Block
 
