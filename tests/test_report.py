@@ -123,7 +123,7 @@ def test_it_says_the_numbers(text: str, assessed: Assessment) -> None:
     ):
         assert heading in page.headings
     assert ["refused", "radar3", "not-finite", "2 tracks"] in page.rows
-    assert text.count("<svg") == 8 + 2, "charts, and two delays: the centre has no clock of its own here"
+    assert text.count("<svg") == 8 + 1, "charts, and the delays of the sources"
     for word in WORDS:
         assert f"<dt>{word}</dt>" in text
 

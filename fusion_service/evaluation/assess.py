@@ -23,19 +23,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service.coverage import covers
-from fusion_service.errors import ReviewError
 from fusion_service.evaluation.consistency import Agreement, Consistency
+from fusion_service.evaluation.ground import (
+    Ground,
+    NothingToScoreError,
+    ScoredTruth,
+    all_times,
+    lay_ground,
+    scored_truth,
+)
 from fusion_service.evaluation.logbook import Logbook
-from fusion_service.evaluation.scoring import Scores, Tally, averages, bounds, plain
+from fusion_service.evaluation.scoring import Scores, Tally, plain
+from fusion_service.evaluation.shared import shared_pairs
 from fusion_service.metrics import DENSE
-from fusion_service.snapshots import STALE_PERIODS, STALE_STEPS, Block, Follower, truth_path, truth_positions
+from fusion_service.snapshots import Block, Follower
 from schemas import Frame, GlobalTracks, LocalTracks, Message, Motion, Truth
 
 __all__ = ["Assessment", "Evaluation", "NothingToScoreError", "assess", "evaluate"]
@@ -46,13 +54,8 @@ Tracks = LocalTracks | GlobalTracks
 
 BLOCK = 32
 """Times scored at once."""
-MOST_TIMES = 5_000_000
 SPREADS = 10.0
 """Without a given cut-off: so many standard deviations of the fused position, rounded up to 1, 2 or 5 times 10^n."""
-
-
-class NothingToScoreError(ReviewError):
-    """There is nothing to score, or not what was asked for."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -159,8 +162,8 @@ def evaluate(
     if centre is None and len(book.centres) > 1:
         raise NothingToScoreError(f"tracks of several centres ({', '.join(book.centres)}): say which one to score")
     centres = [centre] if centre else book.centres
-    ground = _ground(book, centres, frame, space, motion, c)
-    scored = _truth(book.truths, ground, book.times(centres) if centres else None, every, gap)
+    ground = lay_ground(book, centres, frame, space, motion, c)
+    scored = scored_truth(book.truths, ground, book.times(centres) if centres else None, every, gap)
     found, _, _ = _walk(book, ground, scored, scored.times)
     return found[centres[0] if centres else ""]
 
@@ -187,15 +190,15 @@ def assess(
     if not names:
         intervals = [book.traffic["local", name].interval for name in book.sources]
         every = every or min((interval for interval in intervals if interval > 0), default=1.0)
-    ground = _ground(book, names, frame, space, motion, c or book.cutoff(SPREADS))
+    ground = lay_ground(book, names, frame, space, motion, c or book.cutoff(SPREADS))
     at = book.times(names) if names else None
     try:
-        scored, unscored = _truth(truths or book.truths, ground, at, every, gap), None
+        scored, unscored = scored_truth(truths or book.truths, ground, at, every, gap), None
     except ValueError as error:
         scored, unscored = None, str(error)
     if truths and not scored:
         raise NothingToScoreError(f"the given truth does not go with this mission: {unscored}")
-    times = scored.times if scored else _all_times(book, at, every)
+    times = scored.times if scored else all_times(book, at, every)
     found, agreements, sample = _walk(book, ground, scored, times, progress, rows)
     if rows and scored:
         told = sorted(truths or book.truths, key=lambda truth: truth.time)
@@ -211,105 +214,10 @@ def assess(
     )
 
 
-class _Ground(NamedTuple):
-    """What all are scored on. sources: those that can be; motions, limits (s): of each of them and of each centre."""
-
-    frame: Frame
-    axes: tuple[str, ...]
-    speeds: tuple[str, ...]
-    sources: list[str]
-    centres: list[str]
-    left_out: dict[str, str]
-    motions: dict[tuple[str, str], Motion]
-    limits: dict[tuple[str, str], float]
-    c: float
-
-
-class _Truth(NamedTuple):
-    """times (K,), ids of T targets, their states (K, T, m)."""
-
-    times: Times
-    targets: tuple[int, ...]
-    states: Floats
-
-
-def _ground(
-    book: Logbook,
-    centres: Sequence[str],
-    frame: Frame | None,
-    space: tuple[str, ...] | None,
-    motion: Motion | None,
-    c: float,
-) -> _Ground:
-    for name in centres:
-        if name not in book.centres:
-            there = ", ".join(book.centres) or "none"
-            raise NothingToScoreError(f"no tracks of a centre {name!r} (there are: {there})")
-    if centres:
-        first = book.first_pictures[centres[0]]
-        frame, space = frame or first.frame, space or first.space
-    if frame is None or space is None:
-        raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
-    axes = tuple(name for name in "xyz" if name in space)
-    left_out = {name: reason for name in book.sources if (reason := book.unreachable(name, frame, axes))}
-    sources = [name for name in book.sources if name not in left_out]
-    motions: dict[tuple[str, str], Motion] = {}
-    limits: dict[tuple[str, str], float] = {}
-    for name in sources:
-        info = book.infos.get(name)
-        period = info.period if info else book.traffic["local", name].interval
-        motions["local", name] = info.motion if info else motion or Motion("cv", 1.0)
-        limits["local", name] = STALE_PERIODS * period
-    drift = Motion("cv", max((book.infos[name].motion.q for name in sources if name in book.infos), default=1.0))
-    for name in centres:
-        motions["global", name] = drift
-        limits["global", name] = STALE_STEPS * book.traffic["global", name].interval
-    speeds = tuple(f"v{name}" for name in axes)
-    return _Ground(frame, axes, speeds, sources, list(centres), left_out, motions, limits, c)
-
-
-def _truth(truths: Sequence[Truth], ground: _Ground, pictures: Times | None, every: float | None, gap: float) -> _Truth:
-    """ValueError where there is none."""
-    if every is None and pictures is None:
-        raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
-    paths = truth_path(truths, ground.frame, ground.axes, ground.speeds)
-    if not paths:
-        raise NothingToScoreError("no truth to score against")
-    first, last = min(int(known[0]) for known, _ in paths.values()), max(int(known[-1]) for known, _ in paths.values())
-    if every is None:
-        assert pictures is not None
-        times = pictures[(pictures >= first) & (pictures <= last)]
-    else:
-        times = _multiples(first, last, every)
-    if not len(times):
-        raise NothingToScoreError(
-            "no time to score: no picture of the centre, or no multiple of every, while there is truth"
-        )
-    states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
-    states[~np.isfinite(states[:, :, : len(ground.axes)]).all(axis=2)] = np.nan
-    return _Truth(times, tuple(paths), states)
-
-
-def _all_times(book: Logbook, pictures: Times | None, every: float | None) -> Times:
-    if every is None:
-        return pictures if pictures is not None else np.zeros(0, dtype=np.int64)
-    return _multiples(*book.span, every) if book.span else np.zeros(0, dtype=np.int64)
-
-
-def _multiples(first: int, last: int, every: float) -> Times:
-    step = max(round(every * 1e9), 1)
-    if (count := (last - first) // step) > MOST_TIMES:
-        raise NothingToScoreError(
-            f"{count} times every {every:g} s: a clock is wrong, or every (--every) is too short, for a mission of "
-            f"{(last - first) / 1e9:.4g} s"
-        )
-    return np.arange(-(-first // step), last // step + 1, dtype=np.int64) * step
-
-
 def _walk(
     book: Logbook,
-    ground: _Ground,
-    scored: _Truth | None,
+    ground: Ground,
+    scored: ScoredTruth | None,
     times: Times,
     progress: Callable[[float], None] = lambda _: None,
     rows: int = 0,
@@ -352,7 +260,7 @@ def _walk(
 class _Score:
     """The scores of all, gathered block by block."""
 
-    def __init__(self, book: Logbook, ground: _Ground, truth: _Truth) -> None:
+    def __init__(self, book: Logbook, ground: Ground, truth: ScoredTruth) -> None:
         self._ground, self._truth, self._infos = ground, truth, book.infos
         self._exists = np.isfinite(truth.states[:, :, 0])
         count, targets = self._exists.shape
@@ -419,7 +327,7 @@ class _Score:
                 sources=sources,
                 fused=fused,
                 seen=seen,
-                shared=_shared(list(sources.values()), fused, seen, len(self._ground.axes)),
+                shared=shared_pairs(list(sources.values()), fused, seen, len(self._ground.axes)),
                 left_out=self._ground.left_out,
                 begins=self._begins,
                 confirm=np.where((confirmed >= 0) & (self._begins >= 0), after, np.nan),
@@ -434,7 +342,7 @@ def _nothing(m: int, d: int) -> Block:
 class _Thin:
     """Keeps every so many messages of each source and of the first centre, about `rows` tracks of each."""
 
-    def __init__(self, book: Logbook, ground: _Ground, rows: int) -> None:
+    def __init__(self, book: Logbook, ground: Ground, rows: int) -> None:
         self.sample: list[Message] = list(book.infos.values()) if rows else []
         wanted = [("local", name) for name in ground.sources] + [("global", name) for name in ground.centres[:1]]
         self._every = {key: max(1, -(-book.traffic[key].tracks // rows)) for key in wanted} if rows else {}
@@ -445,42 +353,3 @@ class _Thin:
             if self._count[key] % self._every[key] == 0:
                 self.sample.append(message)
             self._count[key] += 1
-
-
-def _shared(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: int) -> dict[str, dict[str, Any]]:
-    classes = {f"seen_by_{n}": seen == n for n in range(2, len(sources) + 1)} | {"seen_by_2_or_more": seen >= 2}
-    both = (seen >= 2) & np.isfinite(fused.errors)
-    best, best_nees = _best_single(sources, both)
-    shared: dict[str, dict[str, Any]] = {}
-    for name, mask in classes.items():
-        pairs = mask & both
-        fused_rmse, fused_anees = averages(fused.errors[pairs], fused.nees[pairs])
-        best_rmse, best_anees = averages(best[mask[both]], best_nees[mask[both]])
-        shared[name] = {
-            "pairs": int(pairs.sum()),
-            "fused_missed": int((mask & ~both).sum()),
-            "fused_rmse": fused_rmse,
-            "best_rmse": best_rmse,
-            "fused_anees": fused_anees,
-            "best_anees": best_anees,
-            "nees_bounds": bounds(d, int(pairs.sum())),
-        }
-    return shared
-
-
-def _best_single(sources: list[Scores], both: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Error and NEES of the best single source on the pairs `both` (K, T), R of them: of those that saw the target
-    then, the one with the least mean square on all the pairs of this target that the same sources saw."""
-    _, group = np.nonzero(both)
-    for index, one in enumerate(sources):
-        group = 2 * group + np.isfinite(one.errors[both])
-        if index % 32 == 31:
-            group = np.unique(group, return_inverse=True)[1]
-    _, group = np.unique(group, return_inverse=True)
-    least, best, best_nees = np.full(len(group), np.inf), *np.full((2, len(group)), np.nan)
-    for one in sources:
-        errors = one.errors[both]
-        total = np.bincount(group, weights=np.nan_to_num(errors) ** 2)[group] if len(group) else errors
-        better = np.isfinite(errors) & (total < least)
-        least[better], best[better], best_nees[better] = total[better], errors[better], one.nees[both][better]
-    return best, best_nees
