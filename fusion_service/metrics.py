@@ -3,25 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from fusion_service import linalg
 
-__all__ = ["Gospa", "assign", "gospa", "identity_switches", "nees", "nees_bounds", "ospa"]
+__all__ = [
+    "Gospa",
+    "assign",
+    "assign_near",
+    "gospa",
+    "identity_switches",
+    "near_pairs",
+    "nees",
+    "nees_bounds",
+    "ospa",
+]
 
 Floats = NDArray[np.float64]
 Indices = NDArray[np.intp]
+Tree: TypeAlias = cKDTree
 
 DENSE = 2500
-"""Pairs up to which all of them are assigned at once."""
+"""Pairs up to which all of them are looked at, and assigned at once."""
+SPARSE = 64
+"""Rows and columns of a connected part above which its assignment is made on its pairs alone."""
 
 
 class Gospa(NamedTuple):
@@ -55,47 +68,76 @@ def gospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0, alpha: flo
     return Gospa((localisation + missed + false) ** (1 / p), localisation, missed, false, assignment)
 
 
+def near_pairs(truth: Floats | Tree, estimates: Floats, c: float) -> tuple[Indices, Indices, Floats]:
+    """All pairs of `truth` (T, d), or a tree of it, and `estimates` (M, d) closer than c: rows and columns (K,), by
+    row and then column, and their distances (K,)."""
+    places = truth.data if isinstance(truth, cKDTree) else truth
+    if len(places) * len(estimates) <= DENSE:
+        gap = places[:, None, :] - estimates[None, :, :]
+        distance = np.sqrt((gap * gap).sum(axis=-1))
+        i, j = np.nonzero(distance < c)
+        return i, j, distance[i, j]
+    tree = truth if isinstance(truth, cKDTree) else cKDTree(truth)
+    near = tree.sparse_distance_matrix(cKDTree(estimates), c, output_type="ndarray")
+    order = np.lexsort((near["j"], near["i"]))
+    i, j = near["i"][order].astype(np.intp), near["j"][order].astype(np.intp)
+    gap = places[i] - estimates[j]
+    distance = np.sqrt((gap * gap).sum(axis=-1))
+    close = distance < c
+    return i[close], j[close], distance[close]
+
+
 def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[Indices, Indices, Floats]:
     """The assignment of (T, d) to (M, d) that both metrics use: rows and columns (K,) of its pairs closer than c, by
-    row, and their distances (K,).
+    row, and their distances (K,)."""
+    i, j, d = near_pairs(truth, estimates, c)
+    kept = assign_near(i, j, c**p - d**p, (len(truth), len(estimates)))
+    return i[kept], j[kept], d[kept]
 
-    It minimises the sum of min(distance, c)^p over min(T, M) pairs, which is to maximise the sum of c^p - distance^p
-    over pairs closer than c: these alone are looked at, and each connected part of them is an assignment of its own.
+
+def assign_near(i: Indices, j: Indices, gain: Floats, shape: tuple[int, int]) -> Indices:
+    """Which of the pairs (i, j), by row and then column, are assigned: one for each row and each column at most, with
+    the largest sum of gains, all above 0. In the order of the pairs.
+
+    With gain = c^p - distance^p of the pairs closer than c, that minimises the sum of min(distance, c)^p over
+    min(T, M) pairs. Each connected part of the pairs is an assignment of its own.
     """
-    if len(truth) * len(estimates) <= DENSE:
-        gap = truth[:, None, :] - estimates[None, :, :]
-        distance = np.sqrt((gap * gap).sum(axis=-1))
-        rows, columns = linear_sum_assignment(np.minimum(distance, c) ** p)
-        close = distance[rows, columns] < c
-        rows, columns = rows[close], columns[close]
-        return rows, columns, distance[rows, columns]
-    tree = cKDTree(estimates)
-    near = tree.query_ball_point(truth, c)
-    i = np.repeat(np.arange(len(truth)), [len(one) for one in near])
-    j = np.array([column for one in near for column in one], dtype=np.intp)
-    gap = truth[i] - estimates[j]
-    d = np.sqrt((gap * gap).sum(axis=-1))
-    i, j, d = i[d < c], j[d < c], d[d < c]
-    nodes = len(truth) + len(estimates)
-    _, part = connected_components(coo_array((np.ones(len(i)), (i, len(truth) + j)), (nodes, nodes)), directed=False)
-    order = np.lexsort((j, i, part[i]))
-    i, j, d = i[order], j[order], d[order]
-    begins = np.flatnonzero(np.diff(part[i], prepend=-1))
+    if shape[0] * shape[1] <= DENSE:
+        return np.sort(_best(i, j, gain)) if len(i) else np.zeros(0, dtype=np.intp)
+    graph = coo_array((np.ones(len(i)), (i, shape[0] + j)), (sum(shape), sum(shape)))
+    _, part = connected_components(graph, directed=False)
+    order = np.argsort(part[i], kind="stable")
+    begins = np.flatnonzero(np.diff(part[i][order], prepend=-1))
     ends = np.append(begins[1:], len(i))
     alone = ends - begins == 1
-    chosen = [begins[alone]]
-    for begin, end in zip(begins[~alone], ends[~alone], strict=True):
-        some, row = np.unique(i[begin:end], return_inverse=True)
-        others, column = np.unique(j[begin:end], return_inverse=True)
-        cost = np.zeros((len(some), len(others)))
-        cost[row, column] = d[begin:end] ** p - c**p
-        pair = np.full(cost.shape, -1)
-        pair[row, column] = np.arange(begin, end)
-        found = pair[linear_sum_assignment(cost)]
-        chosen.append(found[found >= 0])
-    kept = np.sort(np.concatenate(chosen))
-    kept = kept[np.argsort(i[kept], kind="stable")]
-    return i[kept], j[kept], d[kept]
+    chosen = [order[begins[alone]]]
+    for begin, end in zip(begins[~alone].tolist(), ends[~alone].tolist(), strict=True):
+        at = order[begin:end]
+        chosen.append(at[_best(i[at], j[at], gain[at])])
+    return np.sort(np.concatenate(chosen))
+
+
+def _best(i: Indices, j: Indices, gain: Floats) -> Indices:
+    """The same for one part, K > 0 pairs; in any order."""
+    if len(i) == 2:  # they share a row or a column
+        return np.array([int(gain[1] > gain[0])]) if i[0] == i[1] or j[0] == j[1] else np.arange(2)
+    some, row = np.unique(i, return_inverse=True)
+    others, column = np.unique(j, return_inverse=True)
+    if min(len(some), len(others)) > SPARSE:
+        # a column of its own for every row, at no gain, makes a full matching; a cost of 0 would be no edge
+        top, rows = 1 + float(gain.max()), np.arange(len(some))
+        cost = np.concatenate([top - gain, np.full(len(some), top)])
+        edges = np.concatenate([row, rows]), np.concatenate([column, len(others) + rows])
+        matched = min_weight_full_bipartite_matching(coo_array((cost, edges)).tocsr())
+        wanted = matched[0] * (len(others) + len(some)) + matched[1]
+        found: Indices = np.flatnonzero(np.isin(row * (len(others) + len(some)) + column, wanted))
+        return found
+    worth = np.zeros((len(some), len(others)))
+    worth[row, column] = gain
+    pair = np.full(worth.shape, -1)
+    pair[row, column] = np.arange(len(i))
+    kept: Indices = pair[linear_sum_assignment(worth, maximize=True)]
+    return kept[kept >= 0]
 
 
 def ospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> float:

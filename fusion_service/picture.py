@@ -269,9 +269,9 @@ def _draw_tracks(axes: Axes, mission: _Mission, metres: float, when: set[int] | 
 
     axes.grid(color="#e8e8e8", lw=0.6)
     axes.set_axisbelow(True)
-    for _, xy in mission.truth.values():
-        axes.plot(*xy.T / metres, color=TRUTH, lw=5, alpha=0.55, solid_capstyle="round", zorder=2)
-        axes.plot(*xy[0] / metres, "o", color=TRUTH, ms=6, zorder=2)
+    paths = [xy / metres for _, xy in mission.truth.values()]
+    axes.add_collection(LineCollection(paths, colors=TRUTH, lw=5, alpha=0.55, capstyle="round", zorder=2))
+    axes.plot(*np.array([path[0] for path in paths]).reshape(-1, 2).T, "o", color=TRUTH, ms=6, zorder=2)
     for name, tracks in mission.local.items():
         lines = [track.xy / metres for track in tracks]
         axes.add_collection(LineCollection(lines, colors=mission.colours[name], lw=2.2, alpha=0.8, zorder=3))
@@ -309,7 +309,7 @@ def _followed(mission: _Mission) -> list[int]:
 
     followers = {
         target: sum(any(follows(track, target) for track in tracks) for tracks in mission.local.values())
-        for target in mission.truth
+        for target in list(mission.truth)[:MAX_LABELS]
     }
     return sorted((target for target, count in followers.items() if count), key=lambda target: -followers[target])
 
@@ -320,6 +320,7 @@ def _draw_detail(axes: Axes, mission: _Mission, target: int) -> None:
 
     half, path = _detail(mission), mission.truth[target][1]
     middle = path[len(path) // 2]
+    mission = _within(mission, middle - 2 * half, middle + 2 * half)
     _draw_tracks(axes, mission, 1.0, None, 1.0)
     for name, tracks in mission.local.items():
         colour = mission.colours[name]
@@ -327,6 +328,19 @@ def _draw_detail(axes: Axes, mission: _Mission, target: int) -> None:
     axes.set(xlim=(middle[0] - half, middle[0] + half), ylim=(middle[1] - half, middle[1] + half), aspect="equal")
     axes.set_title(f"target {target}, true scale, m", loc="left", size=10)
     axes.tick_params(labelsize=8)
+
+
+def _within(mission: _Mission, low: Floats, high: Floats) -> _Mission:
+    """Of the paths and tracks those whose bounding boxes meet the box from `low` to `high`."""
+
+    def meets(xy: Floats) -> bool:
+        return bool((xy.min(axis=0) <= high).all() and (xy.max(axis=0) >= low).all())
+
+    return mission._replace(
+        truth={target: path for target, path in mission.truth.items() if meets(path[1])},
+        local={name: [track for track in tracks if meets(track.xy)] for name, tracks in mission.local.items()},
+        fused=[track for track in mission.fused if meets(track.xy)],
+    )
 
 
 def _handles(mission: _Mission, scale: int) -> list[object]:

@@ -5,7 +5,9 @@ Times are arrays (K,) of int ns, ascending; positions are in one given frame alo
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -20,34 +22,25 @@ from schemas.messages import TENTATIVE
 __all__ = [
     "STALE_PERIODS",
     "STALE_STEPS",
-    "Snapshot",
-    "centre_snapshots",
+    "Block",
+    "Follower",
+    "Numbers",
     "in_frame",
     "interval",
     "order",
-    "source_snapshots",
     "truth_path",
     "truth_positions",
 ]
 
 Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
+Indices = NDArray[np.intp]
+U64 = NDArray[np.uint64]
 Tracks = LocalTracks | GlobalTracks
-Shown = list[list[tuple[int, int]]]
-"""For each time the tracks shown, as (index of the message, row in it)."""
 
 STALE_PERIODS = 3.0
 STALE_STEPS = 2.0
 TRUTH_GAPS = 3.0
-
-
-class Snapshot(NamedTuple):
-    """The M tracks shown at one time: keys (epoch, id), epoch 0 for a centre's; positions (M, d);
-    covariances (M, d, d)."""
-
-    keys: list[tuple[int, int]]
-    positions: Floats
-    covariances: Floats
 
 
 def order(message: Tracks | Truth) -> tuple[int, int, int]:
@@ -60,29 +53,49 @@ def interval(messages: Sequence[Tracks | Truth]) -> float:
     return _median_step(np.unique([message.time for message in messages]))
 
 
-def truth_path(truths: Sequence[Truth], frame: Frame, axes: tuple[str, ...]) -> dict[int, tuple[Times, Floats]]:
+def truth_path(
+    truths: Sequence[Truth], frame: Frame, axes: tuple[str, ...], more: tuple[str, ...] = ()
+) -> dict[int, tuple[Times, Floats]]:
     """Object id -> its times (L,), ascending, and positions (L, d) in `frame`; the later message of equal times.
 
-    Raises ValueError where truth lacks an axis, `FrameError` where its frame has no relation to `frame`.
+    more: further components, which are NaN where truth does not say them. Raises ValueError where truth lacks an axis,
+    `FrameError` where its frame has no relation to `frame`.
     """
     truths = sorted((truth for truth in truths if len(truth.ids)), key=order)
     moved: list[Floats] = []
     for truth in truths:
-        own = tuple(name for name in "xyz" if name in truth.space)
+        own = tuple(name for name in (*"xyz", *more) if name in truth.space)
         if not set(axes) <= set(own):
             raise ValueError(f"truth has no z, but is asked for {' '.join(axes)}")
         means = truth.means[:, [truth.space.index(name) for name in own]]
-        moved.append(transform(means, np.zeros((*means.shape, len(own))), own, truth.frame, frame)[0][:, : len(axes)])
+        if truth.frame != frame:
+            own, means = _movable(own, means, truth.frame, frame)
+        places = np.full((len(means), len(axes) + len(more)), np.nan)
+        for column, name in enumerate((*axes, *more)):
+            if name in own:
+                places[:, column] = means[:, own.index(name)]
+        moved.append(places)
     if not truths:
         return {}
     ids, places = np.concatenate([truth.ids for truth in truths]), np.concatenate(moved)
     when = np.repeat(np.array([truth.time for truth in truths]), [len(truth.ids) for truth in truths])
-    paths: dict[int, tuple[Times, Floats]] = {}
-    for target in np.unique(ids):
-        rows = np.flatnonzero(ids == target)[::-1]
-        known, last = np.unique(when[rows], return_index=True)
-        paths[int(target)] = known, places[rows[last]]
-    return paths
+    last = np.argsort(ids, kind="stable")
+    ids, when = ids[last], when[last]
+    kept = np.append((ids[1:] != ids[:-1]) | (when[1:] != when[:-1]), True)
+    ids, when, places = ids[kept], when[kept], places[last[kept]]
+    begins = np.flatnonzero(np.append(True, ids[1:] != ids[:-1])).tolist()
+    return {int(ids[begin]): (when[begin:end], places[begin:end]) for begin, end in pairwise([*begins, len(ids)])}
+
+
+def _movable(own: tuple[str, ...], means: Floats, source: Frame, target: Frame) -> tuple[tuple[str, ...], Floats]:
+    """States in another frame; without their derivatives where these cannot be moved."""
+    try:
+        return own, transform(means, np.zeros((*means.shape, len(own))), own, source, target)[0]
+    except FrameError:
+        at = [index for index, name in enumerate(own) if name in "xyz"]
+        short = tuple(own[index] for index in at)
+        still = np.zeros((len(means), len(at), len(at)))
+        return short, transform(means[:, at], still, short, source, target)[0]
 
 
 def truth_positions(known: Times, path: Floats, times: Times, gap: float) -> Floats:
@@ -102,51 +115,157 @@ def truth_positions(known: Times, path: Floats, times: Times, gap: float) -> Flo
     return out
 
 
-def source_snapshots(
-    scans: list[LocalTracks], times: Times, period: float, motion: Motion, frame: Frame, axes: tuple[str, ...]
-) -> list[Snapshot]:
-    """What one source shows at each time: of its newest epoch the newest version of each track, unless a later
-    complete scan left it out or it is older than `STALE_PERIODS` periods; predicted with `motion`.
+class Block(NamedTuple):
+    """The tracks shown at K times, R in all, time after time: rows ends[k]:ends[k + 1] at the time k.
 
-    Tracks that fail `schemas.check_numbers` are not shown. Raises `FrameError` where they cannot be brought into
-    `frame`, or lack an axis.
+    number (R,): of the track, small integers that stand for (epoch, id) as long as its `Follower` lives. states
+    (R, m) in the follower's components, NaN where the track's space lacks one; covariances (R, d, d) of the position.
     """
-    scans = sorted(scans, key=order)
-    sound = [codes == 0 for codes in check_numbers(scans)]
-    shown: Shown = []
-    newest: dict[int, tuple[int, int]] = {}
-    epoch, following = 0, 0
-    for time in times.tolist():
-        while following < len(scans) and scans[following].time <= time:
-            scan = scans[following]
-            if scan.epoch >= epoch:
-                if scan.epoch > epoch or scan.complete:
-                    newest, epoch = {}, scan.epoch
-                rows = enumerate(scan.ids.tolist())
-                newest |= {id_: (following, row) for row, id_ in rows if sound[following][row]}
-            following += 1
-        shown.append([one for one in newest.values() if time - scans[one[0]].time <= STALE_PERIODS * period * 1e9])
-    return _snapshots(scans, shown, times, motion, frame, axes)
+
+    ends: Indices
+    number: Indices
+    states: Floats
+    covariances: Floats
 
 
-def centre_snapshots(
-    pictures: list[GlobalTracks], times: Times, motion: Motion, frame: Frame, axes: tuple[str, ...]
-) -> list[Snapshot]:
-    """What a centre shows at each time: the confirmed and coasting tracks of its newest picture, no older than
-    `STALE_STEPS` median steps; predicted with `motion`."""
-    pictures = sorted(pictures, key=order)
-    faults = check_numbers(pictures)
-    visible = [
-        np.flatnonzero((codes == 0) & (picture.status != TENTATIVE)).tolist()
-        for codes, picture in zip(faults, pictures, strict=True)
-    ]
-    limit = STALE_STEPS * interval(pictures) * 1e9
-    at = np.searchsorted(np.array([picture.time for picture in pictures]), times, side="right") - 1
-    shown: Shown = [
-        [(k, row) for row in visible[k]] if k >= 0 and time - pictures[k].time <= limit else []
-        for k, time in zip(at.tolist(), times.tolist(), strict=True)
-    ]
-    return _snapshots(pictures, shown, times, motion, frame, axes)
+class _Part(NamedTuple):
+    """The sound tracks of one message: numbers (M,), and states (M, n), covariances (M, n, n) in the frame."""
+
+    message: Tracks
+    space: tuple[str, ...]
+    number: Indices
+    means: Floats
+    covariances: Floats
+
+    def take(self, kept: NDArray[np.bool_]) -> _Part:
+        return self._replace(number=self.number[kept], means=self.means[kept], covariances=self.covariances[kept])
+
+
+class Numbers:
+    """A small integer for each (epoch, id)."""
+
+    def __init__(self) -> None:
+        self.keys: list[tuple[int, int]] = []
+        self._known: dict[int, tuple[U64, Indices]] = {}
+        self._last: tuple[int, U64, Indices] | None = None
+
+    def give(self, epoch: int, ids: U64) -> Indices:
+        """The numbers (M,) of `ids` (M,), new ones for new ids."""
+        if self._last is not None and self._last[0] == epoch and np.array_equal(self._last[1], ids):
+            return self._last[2]
+        found = self.find(epoch, ids)
+        if (found < 0).any():
+            new = np.unique(ids[found < 0])
+            begin = len(self.keys)
+            self.keys += [(epoch, id_) for id_ in new.tolist()]
+            known, numbers = self._known.get(epoch, (new[:0], found[:0]))
+            known, numbers = np.append(known, new), np.append(numbers, np.arange(begin, len(self.keys)))
+            by = np.argsort(known)
+            self._known[epoch] = known[by], numbers[by]
+            found = self.find(epoch, ids)
+        self._last = epoch, ids, found
+        return found
+
+    def find(self, epoch: int, ids: U64) -> Indices:
+        """The numbers (M,) of `ids` (M,), -1 for one that is not known."""
+        known, numbers = self._known.get(epoch, (ids[:0], np.zeros(0, dtype=np.intp)))
+        if not len(known):
+            return np.full(len(ids), -1)
+        at = np.minimum(np.searchsorted(known, ids), len(known) - 1)
+        return np.where(known[at] == ids, numbers[at], -1)
+
+
+class Follower:
+    """What one source, or one centre, shows as time goes on.
+
+    A source shows of its newest epoch the newest version of each track, unless a later complete scan left it out or it
+    is older than `limit` seconds; a centre the confirmed and coasting tracks of its newest picture, no older than
+    `limit`. Both predicted with `motion`. Tracks that fail `schemas.check_numbers` are not shown.
+
+    axes: the position's components, more: further components of the states. Messages are taken in the order of
+    `order`; times, too, only ever grow.
+    """
+
+    def __init__(
+        self, limit: float, motion: Motion, frame: Frame, axes: tuple[str, ...], more: tuple[str, ...] = ()
+    ) -> None:
+        self.numbers = Numbers()
+        self.picture: GlobalTracks | None = None
+        self._limit, self._motion = limit * 1e9, motion
+        self._frame, self._axes, self._more = frame, axes, more
+        self._coming: deque[_Part] = deque()
+        self._parts: list[_Part] = []
+        self._epoch = 0
+
+    def take(self, messages: Sequence[Tracks]) -> None:
+        """Messages to be shown from their time on. Raises `FrameError` where a frame has no relation to the frame."""
+        parts: list[_Part | None] = [None] * len(messages)
+        sound = [codes == 0 for codes in check_numbers(messages)]
+        for space, indices, means, covariances in in_frame(messages, self._frame):
+            finite, begin = np.isfinite(means[:, [space.index(name) for name in self._axes]].sum(axis=1)), 0
+            for index in indices:
+                message = messages[index]
+                rows = slice(begin, begin := begin + len(message.ids))
+                number = self.numbers.give(message.epoch if isinstance(message, LocalTracks) else 0, message.ids)
+                part = _Part(message, space, number, means[rows], covariances[rows])
+                good = sound[index] & finite[rows]
+                if isinstance(message, GlobalTracks):
+                    good = good & (message.status != TENTATIVE)
+                parts[index] = part if good.all() else part.take(good)
+        self._coming.extend(part for part in parts if part is not None)
+
+    def show(self, times: Times) -> tuple[Block, list[GlobalTracks | None]]:
+        """What is shown at each of `times` (K,), and of a centre the picture it is from."""
+        entries: list[tuple[int, _Part]] = []
+        pictures: list[GlobalTracks | None] = []
+        for k, time in enumerate(times.tolist()):
+            self._advance(time)
+            entries += [(k, part) for part in self._parts if len(part.number)]
+            pictures.append(self.picture)
+        return self._block(entries, times), pictures
+
+    def _advance(self, time: int) -> None:
+        while self._coming and self._coming[0].message.time <= time:
+            part = self._coming.popleft()
+            message = part.message
+            if isinstance(message, GlobalTracks):
+                self._parts, self.picture = [part], message
+            elif message.epoch >= self._epoch:
+                if message.epoch > self._epoch or message.complete:
+                    self._parts, self._epoch = [], message.epoch
+                elif self._parts and len(part.number):
+                    left = [old.take(~np.isin(old.number, part.number)) for old in self._parts]
+                    self._parts = [old for old in left if len(old.number)]
+                self._parts.append(part)
+        self._parts = [part for part in self._parts if time - part.message.time <= self._limit]
+        if not self._parts:
+            self.picture = None
+
+    def _block(self, entries: list[tuple[int, _Part]], times: Times) -> Block:
+        d, names = len(self._axes), (*self._axes, *self._more)
+        sizes = np.array([len(part.number) for _, part in entries], dtype=np.intp)
+        at = np.array([k for k, _ in entries], dtype=np.intp)
+        ends = np.concatenate([[0], np.cumsum(np.bincount(at, weights=sizes, minlength=len(times)))]).astype(np.intp)
+        states = np.full((ends[-1], len(names)), np.nan)
+        spreads = np.empty((ends[-1], d, d))
+        begins = np.cumsum(sizes) - sizes
+        for space in dict.fromkeys(part.space for _, part in entries):
+            chosen = [index for index, (_, part) in enumerate(entries) if part.space == space]
+            parts = [entries[index][1] for index in chosen]
+            age = np.array([int(times[entries[index][0]]) - entries[index][1].message.time for index in chosen]) / 1e9
+            means = np.concatenate([part.means for part in parts])
+            covariances = np.concatenate([part.covariances for part in parts])
+            dt = np.repeat(age, sizes[chosen])
+            x, P = predict(self._motion, space, means.T, np.moveaxis(covariances, 0, -1), dt)
+            rows = np.repeat(begins[chosen] - (np.cumsum(sizes[chosen]) - sizes[chosen]), sizes[chosen])
+            rows += np.arange(len(rows))
+            for column, name in enumerate(names):
+                if name in space:
+                    states[rows, column] = x[space.index(name)]
+            places = [space.index(name) for name in self._axes]
+            spreads[rows] = np.moveaxis(P[np.ix_(places, places)], -1, 0)
+        number = np.concatenate([part.number for _, part in entries] or [np.zeros(0, dtype=np.intp)])
+        return Block(ends, number, states, spreads)
 
 
 def in_frame(messages: Sequence[Tracks], frame: Frame) -> Iterator[tuple[tuple[str, ...], list[int], Floats, Floats]]:
@@ -165,43 +284,6 @@ def in_frame(messages: Sequence[Tracks], frame: Frame) -> Iterator[tuple[tuple[s
         means, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
         height = one.height if isinstance(one, LocalTracks) else None
         yield one.space, indices, *transform(means, covariances, one.space, one.frame, frame, height)
-
-
-def _snapshots(
-    messages: Sequence[Tracks], shown: Shown, times: Times, motion: Motion, frame: Frame, axes: tuple[str, ...]
-) -> list[Snapshot]:
-    d = len(axes)
-    found: list[Snapshot] = [Snapshot([], np.empty((0, d)), np.empty((0, d, d)))] * len(times)
-    for space, indices, means, covariances in in_frame(messages, frame):
-        if not set(axes) <= set(space):
-            raise FrameError(f"its tracks have no z (their space: {' '.join(space)})")
-        sizes = [len(messages[index].ids) for index in indices]
-        first = dict(zip(indices, (np.cumsum(sizes) - sizes).tolist(), strict=True))
-        chosen = [(k, index, row) for k, tracks in enumerate(shown) for index, row in tracks if index in first]
-        if not chosen:
-            continue
-        rows = np.array([first[index] + row for _, index, row in chosen])
-        dt = np.array([int(times[k]) - messages[index].time for k, index, _ in chosen]) / 1e9
-        x, P = predict(motion, space, means[rows].T, np.moveaxis(covariances[rows], 0, -1), dt)
-        at = [space.index(name) for name in axes]
-        places, spreads = x[at].T, np.moveaxis(P[np.ix_(at, at)], -1, 0)
-        keys = [_key(messages[index], row) for _, index, row in chosen]
-        here = np.isfinite(places.sum(axis=1))
-        ends = np.searchsorted([k for k, _, _ in chosen], np.arange(len(times) + 1))
-        for k, old in enumerate(found):
-            mine = np.arange(ends[k], ends[k + 1])
-            mine = mine[here[mine]]
-            if len(mine):
-                found[k] = Snapshot(
-                    old.keys + [keys[i] for i in mine],
-                    np.concatenate([old.positions, places[mine]]),
-                    np.concatenate([old.covariances, spreads[mine]]),
-                )
-    return found
-
-
-def _key(message: Tracks, row: int) -> tuple[int, int]:
-    return message.epoch if isinstance(message, LocalTracks) else 0, int(message.ids[row])
 
 
 def _median_step(times: Times) -> float:

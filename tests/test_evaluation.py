@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import permutations
 from typing import Any
 
@@ -13,7 +14,8 @@ import pytest
 from missions import FRAME, START, at, info, picture, tracks, truth
 
 from fusion_service.evaluation import METRICS, evaluate, format_table
-from schemas import Ecef, Enu, Local, Message
+from fusion_service.metrics import gospa, ospa
+from schemas import Disk, Ecef, Enu, Local, Message, Truth
 
 SEED = 20250705
 STILL = [[0.0, 0.0]]
@@ -328,6 +330,19 @@ def test_nothing_to_score(mission: list[Message], says: str) -> None:
         evaluate(mission, c=10.0, every=None)
 
 
+def test_a_wrong_clock_does_not_ask_for_a_billion_times() -> None:
+    far = [truth(0, [1], STILL), truth(1e9, [1], STILL), picture(0, [1], STILL)]
+    with pytest.raises(ValueError, match=r"1000000000 times every 1 s: a clock is wrong, or every"):
+        evaluate(far, c=10.0, every=1.0)
+
+
+def test_truth_that_is_no_number_is_no_target() -> None:
+    mission = still(3)
+    broken = truth(2, [2], [], means=np.array([[0.0, 0.0, np.nan, 0.0]]))
+    result = evaluate([*mission, broken], c=10.0, every=None)
+    assert result.exists.tolist() == [[True, False]] * 4
+
+
 def test_one_of_several_centres() -> None:
     other = [picture(t, [1], [[3.0, 0.0]], centre="other") for t in range(4)]
     assert evaluate([*still(3), *other], c=10.0, every=None, centre="other").fused.rmse_position == pytest.approx(3.0)
@@ -349,3 +364,45 @@ def test_the_table_is_aligned_and_says_the_numbers() -> None:
     assert len({len(line) for line in lines[head : head + 4]}) == 1
     pairs = next(line for line in lines if line.startswith("seen by 2 "))
     assert pairs.split()[3:6] == ["5", "0", "3.000"]
+
+
+def test_time_to_confirm_by_hand() -> None:
+    """Target 1 is covered from the start and confirmed at 3 s; target 2 has a local track from 2 s and is confirmed at
+    5 s; target 3 is tracked but never confirmed; target 4 is neither covered nor tracked, though a fused track is there
+    from 4 s on; target 5 is covered and confirmed at once."""
+    places = [[0.0, 0.0], [5000.0, 0.0], [6000.0, 0.0], [7000.0, 0.0], [100.0, 0.0]]
+    mission: list[Message] = [info("a", coverage=Disk(1000.0)), info("b")]
+    for t in range(8):
+        mission.append(truth(t, [1, 2, 3, 4, 5], places))
+        mission.append(tracks("b", t, [2, 3] if t >= 2 else [], places[1:3] if t >= 2 else []))
+        shown = [n for n, since in ((1, 3), (2, 5), (4, 4), (5, 0)) if t >= since]
+        mission.append(picture(t, shown, [places[n - 1] for n in shown]))
+    result = evaluate(mission, c=50.0, every=None)
+    np.testing.assert_array_equal(result.begins, [0, 2, 2, -1, 0])
+    np.testing.assert_array_equal(result.confirm, [3.0, 3.0, np.nan, np.nan, 0.0])
+    assert result.fused.followed == 3, "targets 1, 4 and 5; target 2 for 3 of 8 times only"
+
+
+def test_ospa_and_velocity_over_time() -> None:
+    rng = np.random.default_rng(SEED)
+    mission: list[Message] = []
+    sets = []
+    for t in range(12):
+        there, shown = (rng.uniform(0, 60, (rng.integers(1, 7), 4)) for _ in range(2))
+        sets.append((there, shown))
+        ids = [[10 * t + n for n in range(len(rows))] for rows in (there, shown)]
+        mission += [truth(t, ids[0], [], means=there), picture(t, ids[1], [], means=shown)]
+    result = evaluate(mission, c=20.0, every=None)
+    for k, (there, shown) in enumerate(sets):
+        assert result.fused.series.ospa[k] == pytest.approx(ospa(there[:, [0, 2]], shown[:, [0, 2]], 20.0))
+        found = gospa(there[:, [0, 2]], shown[:, [0, 2]], 20.0)
+        assert result.fused.series.gospa[k] == pytest.approx(found.distance)
+        assert result.fused.series.false[k] == pytest.approx(found.false)
+    squares = []
+    for there, shown in sets:
+        rows = np.flatnonzero((chosen := gospa(there[:, [0, 2]], shown[:, [0, 2]], 20.0).assignment) >= 0)
+        squares.append(((there[rows] - shown[chosen[rows]])[:, [1, 3]] ** 2).sum(axis=1))
+    assert result.fused.rmse_velocity == pytest.approx(np.sqrt(np.concatenate(squares).mean()))
+    flat = [replace(m, space=("x", "y"), means=m.means[:, [0, 2]]) if isinstance(m, Truth) else m for m in mission]
+    assert np.isnan(evaluate(flat, c=20.0, every=None).fused.rmse_velocity), "truth says no velocity"
+    assert np.isnan(evaluate(flat, c=20.0, every=None).fused.siap.velocity_accuracy)

@@ -1,14 +1,17 @@
 """Against brute force over all assignments, cases by hand, and the properties of a metric."""
 
+from collections import deque
 from itertools import permutations
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from fusion_service import metrics
-from fusion_service.metrics import gospa, identity_switches, nees, nees_bounds, ospa
+from fusion_service.evaluation.continuity import Following, Moment, ospa2, siap_of
+from fusion_service.metrics import gospa, identity_switches, near_pairs, nees, nees_bounds, ospa
 
 Array = NDArray[np.float64]
 SEED = 20250704
@@ -131,3 +134,91 @@ def test_many_tracks_are_assigned_as_few_are(spread: float, alpha: float, monkey
         monkeypatch.undo()
         assert sparse[:4] == pytest.approx(dense[:4])
         assert (sparse.assignment == dense.assignment).all()
+
+
+def test_a_large_connected_part_is_assigned_on_its_pairs() -> None:
+    """A cut-off so wide that hundreds of pairs hang together: the same as SciPy's dense assignment."""
+    rng = np.random.default_rng(SEED)
+    truth, estimates = rng.uniform(0, 100, (150, 2)), rng.uniform(0, 100, (170, 2))
+    for c in (12.0, 30.0):
+        distance = np.linalg.norm(truth[:, None] - estimates[None], axis=-1)
+        cost = np.minimum(distance, c) ** 2
+        rows, columns = linear_sum_assignment(cost)
+        got = gospa(truth, estimates, c)
+        assert got.distance**2 == pytest.approx(cost[rows, columns].sum() + c**2 / 2 * 20, rel=1e-12)
+        i, j, d = near_pairs(truth, estimates, c)
+        assert len(i) == (distance < c).sum()
+        np.testing.assert_allclose(d, distance[i, j])
+
+
+def moments(
+    rng: np.random.Generator, times: int
+) -> tuple[list[Moment], list[dict[int, Array]], list[dict[int, Array]]]:
+    """Objects and tracks that come and go at random in a small place; the numbers are not 0, 1, 2."""
+    found, objects, tracks, c = [], [], [], 5.0
+    for _ in range(times):
+        here, shown = (
+            {int(n): rng.uniform(0, 9, 2) for n in rng.choice([3, 5, 8, 13], rng.integers(0, 5), replace=False)}
+            for _ in range(2)
+        )
+        objects.append(here)
+        tracks.append(shown)
+        a, b = (np.array(list(one.values())).reshape(-1, 2) for one in (here, shown))
+        numbers = [np.array(list(one), dtype=np.intp) for one in (here, shown)]
+        i, j, d = near_pairs(a, b, c)
+        found.append(Moment(numbers[0], numbers[1], numbers[0][i], numbers[1][j], d))
+    return found, objects, tracks
+
+
+@pytest.mark.parametrize("times", [1, 2, 5])
+def test_ospa2_against_brute_force(times: int) -> None:
+    """By its definition: time averages for each pair of tracks, then the best of all injections."""
+    rng, c, p = np.random.default_rng(SEED), 5.0, 2.0
+
+    def base(a: int, b: int, objects: list[dict[int, Array]], tracks: list[dict[int, Array]]) -> float:
+        costs = []
+        for here, shown in zip(objects, tracks, strict=True):
+            if a in here and b in shown:
+                costs.append(min(float(np.linalg.norm(here[a] - shown[b])), c))
+            elif a in here or b in shown:
+                costs.append(c)
+        return float(np.mean(costs))
+
+    for _ in range(40):
+        window, objects, tracks = moments(rng, times)
+        names = [sorted({n for one in sets for n in one}) for sets in (objects, tracks)]
+        small, large = sorted(names, key=len)
+        swapped = small is not names[0]
+        table = {
+            (a, b): base(b, a, objects, tracks) if swapped else base(a, b, objects, tracks)
+            for a in small
+            for b in large
+        }
+        most = len(large)
+        best = min(
+            sum(table[a, b] ** p for a, b in zip(small, chosen, strict=True))
+            for chosen in permutations(large, len(small))
+        )
+        want = ((best + c**p * (most - len(small))) / most) ** (1 / p) if most else 0.0
+        assert ospa2(deque(window), c, p) == pytest.approx(want), f"seed {SEED}"
+    assert ospa2(deque(window[:1]), c, p) == pytest.approx(
+        ospa(*(np.array(list(one[0].values())).reshape(-1, 2) for one in (objects, tracks)), c, p)
+    ), "a window of one time is OSPA"
+
+
+def test_siap_by_hand() -> None:
+    """Object 0 at times 0 to 9: track 4 from 0 to 3, track 5 from 2 to 6, nothing at 7, track 5 again at 8 and 9.
+    Object 1: track 6 all the time. Least numbers: 4, 5, 5 and 6."""
+    following = Following(2)
+    of_zero = {4: range(4), 5: [*range(2, 7), 8, 9]}
+    for k in range(10):
+        tracks = [track for track, when in of_zero.items() if k in when]
+        following.add(k, np.array([0] * len(tracks) + [1]), np.array([*tracks, 6]))
+    segments = following.segments(9)
+    assert segments.tolist() == [[0, 4, 0, 3], [0, 5, 2, 6], [0, 5, 8, 9], [1, 6, 0, 9]]
+    times = np.arange(10) * 2 * 10**9
+    siap = siap_of(segments, times, np.array([18.0, 18.0]), (20.0, 19.0, 25.0, 21.0), (3.0, np.nan))
+    assert siap.track_number_changes == pytest.approx((3 - 1 + 1 - 1) / (12 + 2 + 18))
+    assert siap.longest_segment == pytest.approx((8 + 18) / 36)
+    assert (siap.completeness, siap.ambiguity, siap.spuriousness) == pytest.approx((19 / 20, 21 / 19, 4 / 25))
+    assert np.isnan(siap_of(segments[:0], times, np.zeros(0), (0, 0, 0, 0), (np.nan, np.nan)).completeness)

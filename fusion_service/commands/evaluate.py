@@ -1,0 +1,138 @@
+"""`fusion-service evaluate`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fusion_service.errors import ReviewError
+from fusion_service.progress import Progress
+
+if TYPE_CHECKING:
+    from fusion_service.evaluation import Assessment
+    from schemas import Truth
+
+HELP = "How good the tracks of a mission were: against truth where there is any, and against each other."
+EXAMPLE = (
+    "fusion-service evaluate mission.rrd\n"
+    "  fusion-service evaluate mission.rrd --cutoff 5000 --html report.html --json scores.json\n"
+    "  fusion-service evaluate ci.rrd naive.rrd --html rules.html      one row for each centre of each recording\n"
+    "  fusion-service evaluate mission.rrd --truth gps.csv --every 1"
+)
+SAMPLE = 20_000
+"""Tracks of each source on the map, about."""
+
+
+class _StoppedError(Exception):
+    """A signal came."""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("recordings", metavar="FILE", nargs="+", help="recordings (.rrd)")
+    parser.add_argument("--truth", metavar="FILE", help="truth: a recording, or a table as `export` writes it")
+    parser.add_argument(
+        "--cutoff", type=_positive, metavar="M", help="largest error that still counts as followed, m (default: chosen)"
+    )
+    parser.add_argument("--every", type=_positive, metavar="S", help="score so often, s (default: at each step)")
+    parser.add_argument("--centre", metavar="NAME", action="append", help="only this centre; may be repeated")
+    parser.add_argument("--json", metavar="FILE", help="write every number here")
+    parser.add_argument("--html", metavar="FILE", help="write a page for people here")
+
+
+def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    from fusion_service.evaluation.results import results, text
+    from fusion_service.evaluation.truth import read_truth
+
+    pages = [Path(name) for name in (args.json, args.html) if name]
+    for page in pages:
+        if page.is_dir() or not page.parent.is_dir():
+            raise ReviewError(f"cannot write {page}: name a file in a folder that exists")
+    _need_rerun()
+    if args.html:
+        from fusion_service.evaluation.report import need_matplotlib
+
+        need_matplotlib()
+    done: list[Assessment] = []
+    try:
+        truths = read_truth(Path(args.truth)) if args.truth else []
+        for path in map(Path, args.recordings):
+            cutoff = args.cutoff or (done[0].c if done else None)
+            done.append(_assess(path, truths, cutoff, args, stop))
+    except _StoppedError:
+        print(f"stopped: {len(done)} of {len(args.recordings)} recordings are scored")
+    if not done:
+        return
+    wanted = set(args.centre or ())
+    there = {name for one in done for name in one.book.centres}
+    if wanted - there:
+        raise ReviewError(
+            f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
+        )
+    print(text(done))
+    if args.json:
+        Path(args.json).write_text(json.dumps(results(done), allow_nan=False) + "\n", encoding="utf-8")
+        print(f"scores: {args.json}")
+    if args.html:
+        from fusion_service.evaluation.report import report
+
+        Path(args.html).write_text(report(done), encoding="utf-8")
+        print(f"page:   {args.html}")
+
+
+def _need_rerun() -> None:
+    from fusion_service.recording.columns import import_rerun
+
+    try:
+        import_rerun()
+    except ImportError as error:
+        raise ReviewError(str(error)) from None
+
+
+def _assess(
+    path: Path, truths: list[Truth], cutoff: float | None, args: argparse.Namespace, stop: threading.Event
+) -> Assessment:
+    from fusion_service.evaluation import assess
+    from fusion_service.evaluation.logbook import Logbook
+
+    with Progress(path.name) as bar:
+        size = max(path.stat().st_size, 1) if path.is_file() else 1
+
+        def showing(begin: float, share: float, scale: float) -> Callable[[float], None]:
+            def show(done: float) -> None:
+                if stop.is_set():
+                    raise _StoppedError
+                bar.show(begin + share * min(done / scale, 1.0))
+
+            return show
+
+        book = Logbook.read(path, showing(0.0, 0.3, size))
+        if not book.traffic:
+            raise ReviewError(f"{path} holds no tracks, so there is nothing to evaluate")
+        chosen = [name for name in args.centre or () if name in book.centres]
+        if args.centre and not chosen:
+            there = ", ".join(book.centres) or "none"
+            raise ReviewError(f"{path} has no centre {' or '.join(map(repr, args.centre))}; there are: {there}")
+        return assess(
+            book,
+            c=cutoff,
+            every=args.every,
+            centres=chosen,
+            truths=truths,
+            progress=showing(0.3, 0.7, 1.0),
+            rows=SAMPLE if args.html else 0,
+        )
+
+
+def _positive(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
+    return value

@@ -1,0 +1,115 @@
+"""Truth from a file of its own: a recording, or a table of tracks (CSV or Parquet) as `schemas.flat` describes it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion_service.errors import ReviewError
+from schemas import MessageError, Truth, decode
+from schemas.flat import frame_of, space_of
+
+__all__ = ["read_truth"]
+
+Columns = dict[str, list[Any]]
+ROWS = 50_000
+
+
+def read_truth(path: Path) -> list[Truth]:
+    """Its truth messages; of a table one for each run of rows of one time. Raises `ReviewError` for a file that has
+    none or is not as it must be, FileNotFoundError, and what `recording.read` raises."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no truth at {path}")
+    if path.suffix == ".csv":
+        found = [truth for table in _csv(path) for truth in _messages(table, path)]
+    elif path.suffix == ".parquet":
+        found = [truth for table in _parquet(path) for truth in _messages(table, path)]
+    else:
+        found = list(_recorded(path))
+    if not found:
+        raise ReviewError(f"{path} holds no truth: give a recording, or a table with rows of the kind truth")
+    return found
+
+
+def _recorded(path: Path) -> Iterator[Truth]:
+    from fusion_service.recording import read
+
+    for raw in read(path):
+        try:
+            message = decode(raw.data)
+        except MessageError:
+            continue
+        if isinstance(message, Truth):
+            yield message
+
+
+def _csv(path: Path) -> Iterator[Columns]:
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        reader = csv.DictReader(file)
+        wanted = _wanted(tuple(reader.fieldnames or ()), path)
+        table: Columns = {name: [] for name in wanted}
+        for row in reader:
+            if row["kind"] == "truth":
+                for name in wanted:
+                    table[name].append(row[name])
+            if len(table["time_ns"]) == ROWS:
+                yield table
+                table = {name: [] for name in wanted}
+        yield table
+
+
+def _parquet(path: Path) -> Iterator[Columns]:
+    try:
+        from pyarrow import ArrowException, parquet
+    except ImportError as error:
+        raise ReviewError(f"Parquet needs pyarrow ({error}): pip install 'track-fusion-centre[record]'") from None
+    try:
+        file = parquet.ParquetFile(path)
+        wanted = _wanted(tuple(file.schema_arrow.names), path)
+        for batch in file.iter_batches(ROWS, columns=list(wanted)):
+            rows: Columns = batch.to_pydict()
+            mine = [index for index, kind in enumerate(rows["kind"]) if kind == "truth"]
+            yield {name: [column[index] for index in mine] for name, column in rows.items()}
+    except ArrowException as error:
+        raise ReviewError(f"{path} is no Parquet table ({error})") from None
+
+
+def _wanted(columns: tuple[str, ...], path: Path) -> tuple[str, ...]:
+    try:
+        return ("time_ns", "source", "kind", "track_id", "epoch", "frame", *space_of(columns))
+    except ValueError as error:
+        raise ReviewError(f"{path}: {error}") from None
+
+
+def _messages(table: Columns, path: Path) -> Iterator[Truth]:
+    space = tuple(name for name in table if name not in ("time_ns", "source", "kind", "track_id", "epoch", "frame"))
+    if not table["time_ns"]:
+        return
+    try:
+        times = np.array([int(time) for time in table["time_ns"]], dtype=np.int64)
+        ids = np.array([int(track) for track in table["track_id"]], dtype=np.uint64)
+        states = np.array([[float(value) for value in table[name]] for name in space]).T
+        frames = {text: frame_of(text) for text in dict.fromkeys(table["frame"])}
+    except (ValueError, TypeError, OverflowError) as error:
+        raise ReviewError(f"{path}: a row of truth is not as it must be ({error})") from None
+    if not np.isfinite(states).all():
+        raise ReviewError(f"{path}: a row of truth lacks a number of its state")
+    heads = list(zip(times.tolist(), table["source"], table["frame"], strict=True))
+    begins = [index for index, head in enumerate(heads) if not index or head != heads[index - 1]]
+    for begin, end in zip(begins, [*begins[1:], len(heads)], strict=True):
+        time, source, text = heads[begin]
+        yield Truth(
+            source=source or "truth",
+            epoch=0,
+            seq=begin,
+            sent=time,
+            time=time,
+            space=space,
+            frame=frames[text],
+            ids=ids[begin:end],
+            means=states[begin:end],
+        )
