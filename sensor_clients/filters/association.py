@@ -54,7 +54,7 @@ def likelihood(prediction: Prediction, gate: float) -> Floats:
     scale = np.sqrt((2 * math.pi) ** len(nu) * linalg.det(prediction.covariance)) * gate_probability(gate, len(nu))
     density, near = np.zeros_like(distance), distance < gate
     density[near] = np.exp(-0.5 * distance[near])
-    return density / scale[:, None]
+    return np.asarray(density / scale[:, None])
 
 
 def associate(
