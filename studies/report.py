@@ -16,8 +16,6 @@ __all__ = ["as_json", "page", "text", "write_json"]
 PAGE = Path("docs") / "studies.md"
 FOLDER = Path("docs") / "studies"
 """Where full results are kept, and the page made of them."""
-WIDEST = 6
-"""Quantities that fit side by side in one table."""
 
 
 def as_json(study: Study, run: Run, result: Result) -> dict[str, Any]:
@@ -153,7 +151,7 @@ def _tables(study: Study, values: Mapping[str, Any]) -> list[str]:
     quantities = list(dict.fromkeys(row.quantity for row in rows))
     names = list(dict.fromkeys(row.name for row in rows))
     cells = {(row.name, row.quantity): row for row in rows}
-    if len(quantities) > WIDEST or len(cells) < 0.6 * len(quantities) * len(names) or len(cells) < len(rows):
+    if len(quantities) > study.widest or len(cells) < 0.6 * len(quantities) * len(names) or len(cells) < len(rows):
         lines = ["| | quantity | published | ours | |", "|---|---|---|---|---|"]
         for row in rows:
             verdict = compared(row, values["runs"], study.published_runs)

@@ -100,7 +100,8 @@ class Study:
     """An experiment. title: one line; source: paper and section; about: the set-up and the reading, Markdown (the
     page's text; by habit the module's docstring); runs: of the full study, quick: of the same in CI; published_runs:
     what the paper's numbers are averages over, so that their own error is known; seconds: what the full study takes on
-    two cores, measured; takes_rules: whether `--rule` adds to what it compares; needs_data: real recordings."""
+    two cores, measured; takes_rules: whether `--rule` adds to what it compares; needs_data: real recordings; widest:
+    quantities that the page sets side by side at most."""
 
     name: str
     title: str
@@ -113,6 +114,7 @@ class Study:
     published_runs: int | None = None
     takes_rules: bool = False
     needs_data: bool = False
+    widest: int = 6
 
 
 def catalogue() -> Mapping[str, Study]:
