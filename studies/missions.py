@@ -49,8 +49,9 @@ def truths(scenario: Scenario) -> list[Truth]:
     return list(as_messages(scenario.name.replace(":", "-"), scenario.truth(), scenario.origin))
 
 
-def fuse(messages: Iterable[Told], config: Mapping[str, Any]) -> list[GlobalTracks]:
-    """The pictures of a centre of this config that hears `messages`, which come in the order of time."""
+def fuse(messages: Sequence[Told], config: Mapping[str, Any]) -> list[GlobalTracks]:
+    """The pictures of a centre of this config that hears `messages`, which come in the order of time, of sources that
+    are there from the beginning."""
     centre = FusionCentre({"clock": "message", **config})
     clock = MessageClock(centre.config)
     pictures: list[GlobalTracks] = []
@@ -59,16 +60,15 @@ def fuse(messages: Iterable[Told], config: Mapping[str, Any]) -> list[GlobalTrac
         while (time := clock.due()) is not None:
             pictures.append(centre.step(time).tracks)
 
-    heard = set()
+    sources = {message.source for message in messages}
+    for source in sources:
+        clock.presence(source, True)
     for message in messages:
         centre.handle(message, message.sent)
-        if message.source not in heard:
-            heard.add(message.source)
-            clock.presence(message.source, True)
         if isinstance(message, LocalTracks):
             clock.observe(message.source, message.epoch, message.time)
             steps()
-    for source in heard:
+    for source in sources:
         clock.presence(source, False)
     steps()
     return pictures
