@@ -174,21 +174,21 @@ def test_sequential_memory_under_naive_is_a_kalman_filter() -> None:
 def test_scores_are_pooled_over_what_was_tracked() -> None:
     """Two steps, one target, two runs, by hand; the second run has no track at the second step."""
     scores = np.array([[[[1.0, 9.0]], [[4.0, np.nan]]], [[[1.0, 2.0]], [[30.0, np.nan]]]])
-    one = radars.pooled(scores)
+    one = missions.pooled(scores, 4)
     assert one.rmse.value == pytest.approx(np.sqrt(14 / 3))
     assert one.anees.value == pytest.approx(11)
     assert one.there.value == pytest.approx(0.75)
     assert one.high == 0.5  # 30 is above the interval of one run of dimension 4, (1 + 2) / 2 is not
-    half = radars.less(radars.root_mean, scores, scores * 4)
+    half = missions.less(missions.root_mean, scores, scores * 4)
     assert half.value == pytest.approx(-np.sqrt(14 / 3))
 
 
-def test_the_best_radar_is_the_one_of_least_error_that_tracks_for_half_the_time() -> None:
+def test_the_best_source_is_the_one_of_least_error_that_tracks_for_half_the_time() -> None:
     scores = np.full((2, 3, 4, 2, 1), np.nan)
     scores[:, 0, :, 0] = 9.0
     scores[:, 1, :, 0] = 4.0
     scores[:, 2, :1, 0] = 1.0
-    best = radars.best_radar(scores)
+    best = missions.best_source(scores)
     assert (best[:, :, 0] == 4.0).all()
     assert np.isnan(best[:, :, 1]).all()
 
