@@ -26,8 +26,8 @@ What comes out: A has the least error and C the highest, whatever the rule and t
 but alike, near the local estimate (a little below it, by the memory or by a second radar at the edge of its reach).
 HMD-GA has the least RMSE of the three, against ICI by little. CI does not lie at the bottom of *all* NEES plots: where
 one radar is much better than the other, CI by det takes that radar's track alone, with its error and its NEES (targets
-5, 13 and 16 nearly all the time). NEES is lower in A than in B, not higher as the paper has it. `naive` with memory counts the same data twice, and
-shows it.
+5, 13 and 16 nearly all the time). NEES is lower in A than in B, not higher as the paper has it. `naive` with memory
+counts the same data twice, and shows it.
 Target 12 is in reach of radar 2 only, so the paper's B is of eight targets and one of C; the table has it by itself.
 
 `naive` and `bci` with a bound of 0.5 are not in the paper. A `--rule` goes through the centre too; a function of your
