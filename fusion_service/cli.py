@@ -330,7 +330,7 @@ def _call(args: argparse.Namespace, stop: threading.Event) -> int:
     except ConfigError as error:
         print("\n".join(error.problems), file=sys.stderr)
         return 2
-    except (BusError, DemoError, ReviewError, StateError, OSError) as error:
+    except (BusError, DemoError, ImportError, ReviewError, StateError, OSError) as error:
         print(f"fusion-service {args.command}: {error}", file=sys.stderr)
         return 1
     return 0

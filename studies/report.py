@@ -14,10 +14,10 @@ from studies.study import Result, Row, Run, Study
 __all__ = ["as_json", "page", "text", "write_json"]
 
 PAGE = Path("docs") / "studies.md"
+LONG = 40
+"""Rows of a long table beyond which those without a published number are folded."""
 FOLDER = Path("docs") / "studies"
 """Where full results are kept, and the page made of them."""
-WIDEST = 6
-"""Quantities that fit side by side in one table."""
 
 
 def as_json(study: Study, run: Run, result: Result) -> dict[str, Any]:
@@ -158,14 +158,15 @@ def _tables(study: Study, values: Mapping[str, Any]) -> list[str]:
     for quantity in quantities:
         groups.setdefault(quantity.partition(": ")[0], []).append(quantity)
     sparse = len(cells) < 0.6 * len(quantities) * len(names) or len(cells) < len(rows)
-    if not sparse and len(quantities) <= WIDEST:
+    if not sparse and len(quantities) <= study.widest:
         return _grid(study, values, names, {quantity: quantity for quantity in quantities}, cells)
-    if sparse or max(map(len, groups.values())) > WIDEST or not all(": " in quantity for quantity in quantities):
-        lines = ["| | quantity | published | ours | |", "|---|---|---|---|---|"]
-        for row in rows:
-            verdict = compared(row, values["runs"], study.published_runs)
-            lines.append(f"| {row.name} | {row.quantity} | {printed(row)} | {_ours(row)} | {verdict} |")
-        return lines
+    if sparse or max(map(len, groups.values())) > study.widest or not all(": " in quantity for quantity in quantities):
+        theirs = [row for row in rows if row.published is not None]
+        if len(rows) <= LONG or not theirs:
+            return _list(study, values, rows)
+        own = [row for row in rows if row.published is None]
+        fold = ["", f"<details><summary>{len(own)} more rows, of which nothing is published</summary>", ""]
+        return [*_list(study, values, theirs), *fold, *_list(study, values, own), "", "</details>"]
     lines = []
     for head, group in groups.items():
         columns = {quantity: quantity.partition(": ")[2] for quantity in group}
@@ -194,6 +195,14 @@ def _grid(
             verdict = compared(one, values["runs"], study.published_runs)
             line.append(_ours(one) + (f" ({printed(one)}: {verdict})" if one.published is not None else ""))
         lines.append(f"| {name} | " + " | ".join(line) + " |")
+    return lines
+
+
+def _list(study: Study, values: Mapping[str, Any], rows: list[Row]) -> list[str]:
+    lines = ["| | quantity | published | ours | |", "|---|---|---|---|---|"]
+    for row in rows:
+        verdict = compared(row, values["runs"], study.published_runs)
+        lines.append(f"| {row.name} | {row.quantity} | {printed(row)} | {_ours(row)} | {verdict} |")
     return lines
 
 

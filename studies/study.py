@@ -101,7 +101,8 @@ class Study:
     page's text; by habit the module's docstring); runs: of the full study, quick: of the same in CI; published_runs:
     what the paper's numbers are averages over, so that their own error is known; seconds: what the full study takes on
     two cores, measured; takes_rules: whether `--rule` adds to what it compares; needs_data: real recordings;
-    deterministic: false of a study that measures time, whose numbers no seed repeats."""
+    deterministic: false of a study that measures time, whose numbers no seed repeats; widest:
+    quantities that the page sets side by side at most."""
 
     name: str
     title: str
@@ -115,6 +116,7 @@ class Study:
     takes_rules: bool = False
     needs_data: bool = False
     deterministic: bool = True
+    widest: int = 6
 
 
 def catalogue() -> Mapping[str, Study]:

@@ -52,7 +52,9 @@ def likelihood(prediction: Prediction, gate: float) -> Floats:
     if len(nu) == 2:
         distance = distance + 2 * S[0, 1, :, None] * nu[0] * nu[1] + S[1, 1, :, None] * nu[1] ** 2
     scale = np.sqrt((2 * math.pi) ** len(nu) * linalg.det(prediction.covariance)) * gate_probability(gate, len(nu))
-    return np.where(distance < gate, np.exp(-0.5 * np.minimum(distance, gate)), 0.0) / scale[:, None]
+    density, near = np.zeros_like(distance), distance < gate
+    density[near] = np.exp(-0.5 * distance[near])
+    return np.asarray(density / scale[:, None])
 
 
 def associate(
@@ -61,13 +63,17 @@ def associate(
     """Marginal association probabilities by loopy belief propagation.
 
     densities l (T, M), existence r (T,), detection p (T,) including the gate's probability, intensity of
-    what is not a track (M,). Iterates until no message changes by more than `tolerance` (relative).
+    what is not a track (M,). Iterates until no message changes by more than `tolerance` (relative). Tracks
+    without a gated return send nothing and receive the same: one stands for all of them.
     """
     T, M = densities.shape
     if not T:
         return Association(existence, np.zeros((0, M)), np.zeros(0), np.ones(M))
     hit = np.minimum(existence * detection, 1 - 1e-12)
     psi = (hit / (1 - hit))[:, None] * densities / intensity
+    sending = psi.any(axis=1)
+    sending[np.argmin(sending)] = True
+    psi = psi[sending]
     nu = np.ones_like(psi)
     for _ in range(200):
         towards = psi * nu
@@ -78,8 +84,9 @@ def associate(
         if change < tolerance:
             break
     towards = psi * nu
-    total = 1 + towards.sum(axis=1)
-    taken = towards / total[:, None]
+    total, taken = np.ones(T), np.zeros((T, M))
+    total[sending] = 1 + towards.sum(axis=1)
+    taken[sending] = towards / total[sending, None]
     # What misses may still exist: only that part of P(0) is the existing track's own.
     missed = existence * (1 - detection) / (1 - hit) / total
     after = np.minimum(taken.sum(axis=1) + missed, 1.0)

@@ -82,8 +82,14 @@ class RangeAzimuth:
         ).copy()
 
     def difference(self, a: Floats, b: Floats) -> Floats:
+        """Of azimuths that lie within a turn of one another, by steps that cost a tenth of a modulo."""
+        turn = 2 * math.pi
         d = a - b
-        d[1] = (d[1] + math.pi) % (2 * math.pi) - math.pi
+        angle = d[1]
+        angle += math.pi
+        angle += turn * (angle < 0)
+        angle -= turn * (angle >= turn)
+        angle -= math.pi
         return d
 
     def locate(self, returns: Floats) -> tuple[Floats, Floats]:

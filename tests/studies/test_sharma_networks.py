@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import product
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -170,17 +171,16 @@ def test_a_bound_of_one_half_holds_where_a_quarter_does_not(
     assert half + 2 * error < 1
 
 
-def test_the_table_does_not_depend_on_processes_and_takes_rules_of_ones_own() -> None:
-    def half(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
-        return means.mean(axis=0), covariances.mean(axis=0)
-
+def test_the_table_does_not_depend_on_processes_and_takes_rules_of_ones_own(tmp_path: Path) -> None:
     extra = (fuser("bci:max_correlation=0.4"),)
     one, two = (networks.run(Run(100, 2, rules=extra, jobs=jobs), 2) for jobs in (1, 2))
     assert one.rows == two.rows
     assert one.notes == two.notes
     assert any(row.name == "diamond: bci:max_correlation=0.4" for row in one.rows)
-    own = networks.run(Run(100, 2, rules=(Fuser("half", function=half),), jobs=2), 2)
-    assert any(row.name == "star: half" for row in own.rows)
+    file = tmp_path / "own.py"
+    file.write_text("def half(means, covariances):\n    return means.mean(axis=0), covariances.mean(axis=0)\n")
+    own = networks.run(Run(100, 2, rules=(fuser(f"{file}:half"),), jobs=2), 2)
+    assert any(row.name == "star: own.half" for row in own.rows)
     assert [row for row in own.rows if "half" not in row.name] == [row for row in one.rows if "0.4" not in row.name]
 
 
