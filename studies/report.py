@@ -167,7 +167,7 @@ def _tables(study: Study, values: Mapping[str, Any]) -> list[str]:
         own = [row for row in rows if row.published is None]
         fold = ["", f"<details><summary>{len(own)} more rows, of which nothing is published</summary>", ""]
         return [*_list(study, values, theirs), *fold, *_list(study, values, own), "", "</details>"]
-    lines = []
+    lines: list[str] = []
     for head, group in groups.items():
         columns = {quantity: quantity.partition(": ")[2] for quantity in group}
         there = [name for name in names if any((name, quantity) in cells for quantity in group)]
