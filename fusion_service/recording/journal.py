@@ -119,12 +119,14 @@ class Journal:
             self.say("track", INFO, f"{message.source}: {text}", stamp)
 
     def tracks(self, message: GlobalTracks, stamp: Stamp) -> None:
-        """Ended, merged and split global tracks."""
+        """Ended, merged and split global tracks; whose, where there are several centres."""
+        centres = {name for kind, name in self._epochs if kind == "service"}
+        whose = f" of {message.source}" if len(centres) > 1 else ""
         for track, reason, heir in message.ended:
             into = f", goes on as {self._label(heir)}" if heir is not None else ""
-            self.say("tracks", INFO, f"track {self._label(track)} ended: {reason}{into}", stamp)
+            self.say("tracks", INFO, f"track {self._label(track)}{whose} ended: {reason}{into}", stamp)
         for new, old in message.split_from:
-            self.say("tracks", INFO, f"track {self._label(new)} split from {self._label(old)}", stamp)
+            self.say("tracks", INFO, f"track {self._label(new)}{whose} split from {self._label(old)}", stamp)
 
 
 def _state(said: dict[str, Any]) -> str:
