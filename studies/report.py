@@ -14,8 +14,8 @@ from studies.study import Result, Row, Run, Study
 __all__ = ["as_json", "page", "text", "write_json"]
 
 PAGE = Path("docs") / "studies.md"
-LONG = 40
-"""Rows of a long table beyond which those without a published number are folded."""
+LONG, SOME = 40, 12
+"""Rows of a table beyond which what has no published number is folded, and how many are shown where none has one."""
 FOLDER = Path("docs") / "studies"
 """Where full results are kept, and the page made of them."""
 
@@ -161,19 +161,25 @@ def _tables(study: Study, values: Mapping[str, Any]) -> list[str]:
     if not sparse and len(quantities) <= study.widest:
         return _grid(study, values, names, {quantity: quantity for quantity in quantities}, cells)
     if sparse or max(map(len, groups.values())) > study.widest or not all(": " in quantity for quantity in quantities):
-        theirs = [row for row in rows if row.published is not None]
-        if len(rows) <= LONG or not theirs:
+        theirs = [row for row in rows if row.published is not None] or rows[:SOME]
+        if len(rows) <= LONG:
             return _list(study, values, rows)
-        own = [row for row in rows if row.published is None]
-        fold = ["", f"<details><summary>{len(own)} more rows, of which nothing is published</summary>", ""]
-        return [*_list(study, values, theirs), *fold, *_list(study, values, own), "", "</details>"]
-    lines: list[str] = []
-    for head, group in groups.items():
+        own = [row for row in rows if row not in theirs]
+        return [*_list(study, values, theirs), *_folded(f"{len(own)} more rows", _list(study, values, own))]
+    shown: list[str] = []
+    more: list[str] = []
+    for number, (head, group) in enumerate(groups.items()):
         columns = {quantity: quantity.partition(": ")[2] for quantity in group}
         there = [name for name in names if any((name, quantity) in cells for quantity in group)]
+        published = any(row.published is not None for row in rows if row.quantity in group)
+        lines = shown if not number or published or len(rows) <= LONG else more
         lines += [*([""] if lines else []), f"{head[0].upper()}{head[1:]}:", ""]
         lines += _grid(study, values, there, columns, cells)
-    return lines
+    return [*shown, *(_folded("more tables, of which nothing is published", more) if more else [])]
+
+
+def _folded(summary: str, lines: list[str]) -> list[str]:
+    return ["", f"<details><summary>{summary}</summary>", "", *lines, "", "</details>"]
 
 
 def _grid(
