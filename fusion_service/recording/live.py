@@ -82,11 +82,6 @@ class Live:
         self._thread = threading.Thread(target=self._serve, name="live", daemon=True)
         self._thread.start()
 
-    @property
-    def stalled(self) -> bool:
-        """Whether a viewer holds the server up just now."""
-        return self._stalled
-
     def row(self, row: Row) -> None:
         """One row, sent with the next `push`."""
         self._fresh.append(row)

@@ -18,7 +18,7 @@ from typing import BinaryIO
 
 from fusion_service.errors import ReviewError
 
-__all__ = ["DEFAULT_SIZE", "Folder", "Rotation", "begin", "is_folder", "nobody_writes", "number_of", "parts"]
+__all__ = ["DEFAULT_SIZE", "Folder", "Rotation", "begin", "is_folder", "nobody_writes", "number_of", "parts", "unused"]
 
 log = logging.getLogger(__name__)
 
@@ -100,6 +100,13 @@ def nobody_writes(path: Path) -> Iterator[None]:
         except OSError:  # a file system without locks
             pass
         yield
+
+
+def unused(path: str | Path) -> Path:
+    """`path`, for a recording that is not to go on from another. `FileExistsError` for a folder with parts."""
+    if Path(path).is_dir() and parts(Path(path)):
+        raise FileExistsError(f"{path} holds a recording already: name another file or folder")
+    return Path(path)
 
 
 class Folder:
