@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from processes import Hub, Program
+from processes import Hub, Program, eventually
 from recording.contents import entities, rows, static
 from recording.mission import RADARS, Sent, mission
 from rerun.chunk import RrdReader
@@ -347,13 +347,10 @@ def test_the_process_loses_nothing_when_it_rotates_under_load_and_is_killed(hub:
         Program(LOAD, hub.endpoint, "150", str(Path(__file__).parents[1])) as load,
     ):
         assert load.line(20) == "ready"
-        deadline = time.monotonic() + 20
-        while not (folder.is_dir() and parts(folder)):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        eventually(lambda: folder.is_dir() and parts(folder), 20)
         load.tell()
         assert load.line(30) == "done"
-        time.sleep(1.0)
+        eventually(lambda: sum(1 for _ in read(folder)) == len(said), 20)
         recorder.signal(signal.SIGKILL)
         recorder.kill()
     found = list(read(folder))
@@ -363,11 +360,7 @@ def test_the_process_loses_nothing_when_it_rotates_under_load_and_is_killed(hub:
     assert all(a.received <= b.received for a, b in pairwise(found) if a.key == b.key)
     count = len(parts(folder))
     with Program(run) as recorder, open_bus([hub.endpoint], wait=10):
-        deadline = time.monotonic() + 20
-        while len(parts(folder)) == count:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        time.sleep(0.3)
+        eventually(lambda: len(parts(folder)) > count, 20)
         recorder.signal(signal.SIGTERM)
         assert recorder.end()[0] == 0
     assert [raw.data for raw in read(folder)][: len(found)] == [raw.data for raw in found]
