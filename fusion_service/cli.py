@@ -11,6 +11,7 @@ import math
 import sys
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from fusion_service import units
@@ -241,13 +242,15 @@ def _record(args: argparse.Namespace, stop: threading.Event) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists() and (rotation is None or path.is_file()):
         raise FileExistsError(f"{path} exists already: name another file, or move it away")
-    live = None
-    if args.live or args.live_web:
-        if args.no_draw:
-            raise ConfigError(["fusion-service record: --live shows what is drawn: leave out --no-draw"])
-        live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
-        print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
-    with open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop) as bus:
+    if (args.live or args.live_web) and args.no_draw:
+        raise ConfigError(["fusion-service record: --live shows what is drawn: leave out --no-draw"])
+    with ExitStack() as stack:
+        live = None
+        if args.live or args.live_web:
+            live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
+            stack.callback(live.close)
+            print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
+        bus = stack.enter_context(open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop))
         run_recorder(
             bus,
             path,

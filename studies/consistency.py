@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from studies import correlation
 from studies.pictures import colour, ellipse
 from studies.statistics import Estimate, jackknife, mean
 from studies.study import Floats, Row
@@ -45,8 +46,7 @@ def moments(errors: Floats, covariances: Floats, groups: int = GROUPS) -> Floats
 def excess(blocks: Floats) -> float:
     """Largest eigenvalue of the MSE relative to the mean reported covariance, of `moments`."""
     mse, P = blocks.mean(axis=-1)
-    C = np.linalg.inv(np.linalg.cholesky(P))
-    return float(np.linalg.eigvalsh(C @ mse @ C.T)[-1])
+    return float(correlation.excess(mse, P))
 
 
 def consistency(blocks: Floats) -> Consistency:

@@ -25,8 +25,8 @@ Network = tuple[tuple[int, tuple[int, ...]], ...]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Model:
-    """What the nodes see: H and R (nodes, 2, 2) at each of `steps` times of x' = F x + w, w ~ N(0, Q); prior: the
-    covariance of an initial estimate of mean (0, 1)."""
+    """What the nodes see: H and R (nodes, 2, 2) at each of `steps` times of x' = F x + w, w ~ N(0, Q), Q diagonal;
+    prior: the covariance of an initial estimate of mean (0, 1)."""
 
     H: Floats
     R: Floats

@@ -190,7 +190,7 @@ def _grid(
     cells: Mapping[tuple[str, str], Row],
 ) -> list[str]:
     """columns: the heading of every quantity."""
-    lines = ["| | " + " | ".join(columns.values()) + " |", "|---" * (len(columns) + 1) + "|"]
+    lines = ["| | " + " | ".join(map(_cell, columns.values())) + " |", "|---" * (len(columns) + 1) + "|"]
     for name in names:
         line = []
         for quantity in columns:
@@ -200,7 +200,7 @@ def _grid(
                 continue
             verdict = compared(one, values["runs"], study.published_runs)
             line.append(_ours(one) + (f" ({printed(one)}: {verdict})" if one.published is not None else ""))
-        lines.append(f"| {name} | " + " | ".join(line) + " |")
+        lines.append(f"| {_cell(name)} | " + " | ".join(line) + " |")
     return lines
 
 
@@ -208,8 +208,13 @@ def _list(study: Study, values: Mapping[str, Any], rows: list[Row]) -> list[str]
     lines = ["| | quantity | published | ours | |", "|---|---|---|---|---|"]
     for row in rows:
         verdict = compared(row, values["runs"], study.published_runs)
-        lines.append(f"| {row.name} | {row.quantity} | {printed(row)} | {_ours(row)} | {verdict} |")
+        lines.append(f"| {_cell(row.name)} | {_cell(row.quantity)} | {printed(row)} | {_ours(row)} | {verdict} |")
     return lines
+
+
+def _cell(text: str) -> str:
+    """In a table of Markdown a bar would end the cell."""
+    return text.replace("|", r"\|")
 
 
 def _ours(row: Row) -> str:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Estimate", "armse", "jackknife", "mean", "rmse"]
+__all__ = ["Estimate", "armse", "jackknife", "mean", "pooled_rms", "rmse"]
 
 Floats = NDArray[np.float64]
 
@@ -41,6 +41,11 @@ def armse(squared: Floats) -> Estimate:
     root = np.sqrt(mse)
     moved = ((squared - mse[:, None]) / (2 * np.maximum(root, 1e-300))[:, None]).mean(axis=0)
     return Estimate(float(root.mean()), float(np.std(moved, ddof=1) / np.sqrt(squared.shape[1])))
+
+
+def pooled_rms(samples: Floats) -> float:
+    """Root of the mean squared error of all runs together, of (2, M): each run's sum of squares, and their number."""
+    return float(np.sqrt(samples[0].sum() / max(samples[1].sum(), 1e-9)))
 
 
 def jackknife(statistic: Callable[[Floats], float], samples: Floats, groups: int = 50) -> Estimate:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusion_service import linalg
 from fusion_service.densities import Mixtures, kl_gaussians, log_gaussian, overlap_gaussians
 from studies.statistics import mean
-from studies.study import Floats
+from studies.study import Floats, Row
 
 __all__ = [
     "FIRST_MEAN",
@@ -35,6 +35,7 @@ __all__ = [
     "prior",
     "random_gaussians",
     "report",
+    "search_rows",
     "update",
 ]
 
@@ -126,6 +127,17 @@ def newton(slopes: Slopes, start: Floats, tolerance: float = 1e-4, clamp: bool =
             settled[busy] = step <= tolerance
             busy = busy[(step > tolerance) & np.isfinite(new)]
     return Search(w, updates, settled)
+
+
+def search_rows(name: str, updates: Floats, error: Floats) -> list[Row]:
+    """How a search fares: updates (B,), NaN where it fails, and error (B,) of the weight."""
+    good = np.isfinite(updates)
+    rows = [Row(name, "failures, %", None, *percent(~good))]
+    if good.sum() > 1:
+        if updates[good].any():
+            rows.append(Row(name, "updates where it works", None, *mean(updates[good])))
+        rows.append(Row(name, "largest error where it works", None, float(error[good].max())))
+    return rows
 
 
 def bisect(lower: Callable[[Floats], NDArray[np.bool_]], size: int) -> Floats:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from missions import info, picture, tracks
 from recording.mission import START, Sent, mission
 
 from fusion_service.cli import main
@@ -21,7 +22,7 @@ from fusion_service.evaluation import assess, evaluate
 from fusion_service.evaluation.logbook import Logbook
 from fusion_service.export import export
 from fusion_service.recording import Recorder, messages
-from schemas import Entry, GlobalTracks, StepLog, Truth, global_key
+from schemas import Entry, GlobalTracks, StepLog, Truth, digest, global_key
 
 CUTOFF, STEPS = 500.0, 100
 SECOND = 10**9
@@ -202,6 +203,21 @@ def test_reactions_need_the_log_of_the_step() -> None:
     assert found.n == 3, "the first picture is as of a replay: sent at the time of its step"
     assert found.median == pytest.approx(0.2)
     assert sum(found.counts) == 3
+
+
+def test_the_reaction_to_an_info_is_not_that_to_tracks_of_its_number() -> None:
+    """A step that took an info alone: tracks of the same source, epoch and number came a minute before."""
+    book, second = Logbook(), 10**9
+    said = tracks("a", 0, [1], [[0.0, 0.0]])
+    told = replace(info("a"), epoch=said.epoch, seq=said.seq)
+    shown = replace(picture(60, [1], [[0.0, 0.0]]), sent=START + 1)
+    log = next(one.message for one in mission(4) if isinstance(one.message, StepLog))
+    taken = Entry("a", told.epoch, told.seq, digest(told))
+    log = replace(log, source=shown.source, epoch=shown.epoch, step=shown.step, taken=(taken,))
+    for arrival, (message, at) in enumerate([(said, 0.0), (told, 60.0), (log, 60.1), (shown, 60.1)]):
+        book._note(message, arrival, START + round(at * second))
+    book._close()
+    assert book.latency["reaction", shown.source].largest == pytest.approx(0.1)
 
 
 def test_what_cannot_be_evaluated_is_told_in_one_line(

@@ -166,6 +166,7 @@ def test_the_centre_shows_confirmed_and_coasting_tracks() -> None:
     result = evaluate(mission, c=10.0, every=None)
     np.testing.assert_array_equal(np.isnan(result.fused.errors), [[True, False, False]] * 4)
     assert result.fused.gospa_missed == 50.0
+    assert result.fused.tracks == 2
     assert result.sources == {}
     assert "several sources" not in format_table(result)
 

@@ -120,6 +120,10 @@ def test_rules_know_no_track() -> None:
             assert {name for name in ours(names) if not below(name, allowed)} == set(), module
 
 
+def test_what_is_installed_stands_without_studies_benchmarks_and_tests() -> None:
+    assert breaches(set(PACKAGES), {"studies", "benchmarks", "tests"}) == []
+
+
 @pytest.mark.parametrize("name", ["centre", "association", "lifecycle"])
 def test_the_centre_knows_no_bus(name: str) -> None:
     """Neither directly nor through what it imports."""

@@ -405,6 +405,8 @@ def test_little_is_held_however_long_the_mission(tmp_path: Path) -> None:
 
 def test_mistakes_are_told_before_anything_is_written(mission: Path, tmp_path: Path, capsys: Any) -> None:
     out = tmp_path / "out.rrd"
+    (mission.parent / "parts").mkdir()
+    (mission.parent / "parts" / "0001.rrd").touch()
     cases: list[tuple[list[str], int, str]] = [
         (["--rule", "magic", "--out", str(out)], 2, "magic"),
         (["--rule", "ci:criterion", "--out", str(out)], 2, "write NAME or NAME:OPTION=VALUE"),
@@ -414,6 +416,7 @@ def test_mistakes_are_told_before_anything_is_written(mission: Path, tmp_path: P
         ([], 1, "nothing to do"),
         (["--verify", "--rule", "ci"], 1, "leave out --rule"),
         (["--out", str(mission)], 1, "exists already"),
+        (["--out", str(mission.parent / "parts")], 1, "holds a recording already"),
         (["--out", str(out), "--config", "nowhere.toml"], 2, "cannot be read"),
         (["--out", str(out), "--centre", "nobody"], 1, "holds no centre 'nobody'"),
     ]

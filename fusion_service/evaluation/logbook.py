@@ -35,6 +35,7 @@ from schemas import (
     StepLog,
     Truth,
     decode,
+    digest,
 )
 from schemas.messages import BROKEN, CONFIRMED, GATE_FAILED, KEPT
 
@@ -44,6 +45,7 @@ Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 Tracks = LocalTracks | GlobalTracks
 Step = tuple[str, int, int]
+Name = TypeVar("Name")
 Value = TypeVar("Value")
 
 SAME_CLOCK = 3600.0
@@ -144,7 +146,9 @@ class Logbook:
         self._columns["arrival"] = array("q")
         self._spreads: dict[str, array[float]] = {"local": array("d"), "global": array("d")}
         self._delays: dict[tuple[str, str], array[float]] = {}
-        self._came: dict[tuple[str, int, int], int] = {}
+        self._came: dict[Step, int] = {}
+        self._infos_came: dict[int, int] = {}
+        """By digest: every type of a source's messages has sequence numbers of its own."""
         self._taken: dict[tuple[str, int, int], tuple[int | None, int | None]] = {}
         self._held: dict[int, Tracks] = {}
         for arrival, message in enumerate(messages):
@@ -262,6 +266,8 @@ class Logbook:
         elif isinstance(message, SensorInfo):
             known = self.infos.get(name, message)
             self.infos[name] = max(known, message, key=lambda info: (info.epoch, info.seq))
+            if received is not None:
+                _remember(self._infos_came, digest(message), received)
         elif isinstance(message, LocalIntensity):
             self._note_traffic("intensity", message, len(message.weights), arrival, received)
         elif isinstance(message, LocalTracks | GlobalTracks):
@@ -337,7 +343,10 @@ class Logbook:
             n, total = account.innovation.get(source, (0, 0.0))
             account.innovation[source] = n + len(value), total + float(value.sum())
         if received is not None:
-            came = [self._came.get((one.source, one.epoch, one.seq)) for one in message.taken]
+            came = [
+                self._infos_came.get(one.hash) or self._came.get((one.source, one.epoch, one.seq))
+                for one in message.taken
+            ]
             newest = max((time for time in came if time is not None), default=None)
             if newest is not None:
                 self._react((message.source, message.epoch, message.step), taken=newest)
@@ -368,7 +377,7 @@ class Logbook:
             values = np.frombuffer(delays, dtype=np.float64)
             if abs(float(np.median(values))) < SAME_CLOCK:
                 self.latency[key] = _latency(values)
-        self._delays, self._came, self._taken = {}, {}, {}
+        self._delays, self._came, self._infos_came, self._taken = {}, {}, {}, {}
 
 
 def _by_a_clock(message: Tracks | LocalIntensity) -> bool:
@@ -376,9 +385,9 @@ def _by_a_clock(message: Tracks | LocalIntensity) -> bool:
     return not (isinstance(message, GlobalTracks) and message.sent == message.time)
 
 
-def _remember(known: dict[Step, Value], step: Step, value: Value) -> None:
+def _remember(known: dict[Name, Value], name: Name, value: Value) -> None:
     """The newest so many; what has waited longest for what belongs to it is forgotten."""
-    known[step] = value
+    known[name] = value
     if len(known) > HELD:
         del known[next(iter(known))]
 

@@ -80,7 +80,7 @@ class Scores:
     mean NEES of position over its dimension (1 is ideal), are NaN without a pair. bounds: 95 % for the anees of
     so many pairs. errors (K, T), m, and nees (K, T), over the dimension: NaN where no track was assigned.
     rmse_velocity, m/s: NaN without velocities. ospa, ospa2: means, m. followed: targets that had a track assigned at
-    half of their times or more.
+    half of their times or more. tracks: how many were ever shown.
     """
 
     gospa: float
@@ -136,7 +136,8 @@ class Tally:
         """Of SIAP's errors of position and of velocity, and how many there are."""
         self._velocity = np.zeros(2)
         """Sum of the squared errors of velocity of the pairs, and their number."""
-        self._tracks = 0
+        self._tracks = np.zeros(0, dtype=np.bool_)
+        """By the number of a track: whether it was ever shown."""
         self._following = Following(targets)
         self._window: deque[Moment] = deque(maxlen=WINDOW)
         self._stride = max(1, count // WINDOWS)
@@ -146,6 +147,9 @@ class Tally:
         """What `block` shows at its time `row`, the k-th: `there` are the targets that exist, `tree` their places."""
         mine = slice(int(block.ends[row]), int(block.ends[row + 1]))
         states, number, d, c = block.states[mine], block.number[mine], self._d, self._c
+        if number.max(initial=-1) >= len(self._tracks):
+            self._tracks = np.pad(self._tracks, (0, int(number.max()) + 1))
+        self._tracks[number] = True
         truth = self._truth[k, there]
         crowd = tree if tree is not None and len(there) * len(states) > DENSE else truth[:, :d]
         i, j, apart = near_pairs(crowd, states[:, :d], c)
@@ -169,7 +173,8 @@ class Tally:
             self._window.clear()
 
     def expect(self, k: int, number: float) -> None:
-        """How many objects the existence probabilities of what is shown at the k-th time expect."""
+        """How many objects the existence probabilities in the picture of the k-th time expect, tentative tracks'
+        too."""
         self._expected[k] = number
 
     def _score(
@@ -188,7 +193,6 @@ class Tally:
         self._parts[k] = squared, c**P / 2 * (objects - len(targets)), c**P / 2 * (shown - len(targets))
         self._ospa[k] = ((squared + c**P * (most - len(targets))) / most) ** (1 / P) if most else 0.0
         self._shown[k] = shown
-        self._tracks = max(self._tracks, int(block.number.max(initial=-1)) + 1)
         self._errors[k, targets] = apart
         offset = block.states[rows] - self._truth[k, targets]
         self._nees[k, targets] = nees(offset[:, :d], block.covariances[rows]) / d
@@ -243,7 +247,7 @@ class Tally:
             ospa=float(self._ospa.mean()),
             ospa2=float(tracks2.mean()),
             followed=int((pairs.sum(axis=0) >= np.maximum(HALF * exists.sum(axis=0), 1)).sum()),
-            tracks=self._tracks,
+            tracks=int(self._tracks.sum()),
             siap=siap_of(
                 self._following.segments(len(self._times) - 1),
                 self._times,

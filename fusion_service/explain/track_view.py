@@ -15,6 +15,7 @@ from fusion_service import geodesy
 from fusion_service.densities import moments
 from fusion_service.explain.mission import Mission
 from fusion_service.recording import Recorder, read
+from fusion_service.recording.parts import unused
 from fusion_service.recording.survey import key_of
 from schemas import GlobalTracks, LocalTracks, Message, MessageError, StepLog, Truth, decode, encode
 
@@ -31,7 +32,7 @@ def write_view(mission: Mission, out: str | Path, stop: Event | None = None) -> 
     stop = stop or Event()
     assert mission.story is not None, "the mission is read with a track"
     near = _near(mission, stop)
-    with Recorder(out, realm=mission.centre.realm, focus=mission.story.track) as recorder:
+    with Recorder(unused(out), realm=mission.centre.realm, focus=mission.story.track) as recorder:
         for raw in read(mission.path):
             if stop.is_set():
                 break

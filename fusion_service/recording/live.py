@@ -58,6 +58,11 @@ class Live:
         rr = import_rerun()
         host = _resolved(host)
         _check_free(host, port)
+        binary = None if web is None else find_program()
+        if web is not None:
+            if binary is None:
+                raise OSError("rerun's command line program is not installed: the page cannot be served")
+            _check_free(host, web)
         self.dropped = 0
         self.page: str | None = None
         beyond = [f"http://*:{web}"] if web is not None and not _is_loopback(host) else []
@@ -76,16 +81,11 @@ class Live:
         self._blueprint: Any = None
         self._stop = False
         self._stalled = False
-        self._web = None if web is None else _Page(host, web, self.url)
+        self._web = None if web is None or binary is None else _Page(binary, host, web, self.url)
         if self._web is not None:
             self.page = self._web.url
         self._thread = threading.Thread(target=self._serve, name="live", daemon=True)
         self._thread.start()
-
-    @property
-    def stalled(self) -> bool:
-        """Whether a viewer holds the server up just now."""
-        return self._stalled
 
     def row(self, row: Row) -> None:
         """One row, sent with the next `push`."""
@@ -174,11 +174,7 @@ class _Page:
 
     SHELL = '"$@" >/dev/null 2>&1 & child=$!; read -r _; kill "$child" 2>/dev/null; wait "$child" 2>/dev/null'
 
-    def __init__(self, host: str, port: int, source: str) -> None:
-        binary = find_program()
-        if binary is None:
-            raise OSError("rerun's command line program is not installed: the page cannot be served")
-        _check_free(host, port)
+    def __init__(self, binary: Path, host: str, port: int, source: str) -> None:
         self.url = f"http://{_shown(host)}:{port}/?url={urllib.parse.quote(source, safe='')}"
         self._home = tempfile.TemporaryDirectory(prefix="rerun-")
         command = [str(binary), "--serve-web", "--bind", host, "--web-viewer-port", str(port), source]

@@ -11,10 +11,14 @@ import logging
 import os
 import re
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
-__all__ = ["DEFAULT_SIZE", "Folder", "Rotation", "is_folder", "number_of", "parts"]
+from fusion_service.errors import ReviewError
+
+__all__ = ["DEFAULT_SIZE", "Folder", "Rotation", "begin", "is_folder", "nobody_writes", "number_of", "parts", "unused"]
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +76,39 @@ def is_folder(path: str | Path) -> bool:
     return str(path).endswith(("/", os.sep)) or Path(path).is_dir()
 
 
+def begin(path: Path) -> BinaryIO:
+    """Make the file of a recording; it is known as being written until what is returned is closed, or its process
+    ends. `FileExistsError` if there is one."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        file = path.open("xb")
+    except FileExistsError:
+        raise FileExistsError(f"{path} exists already: name another file, or move it away") from None
+    with contextlib.suppress(OSError):  # a file system without locks
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    return file
+
+
+@contextlib.contextmanager
+def nobody_writes(path: Path) -> Iterator[None]:
+    """`ReviewError` if a recorder, or another who mends, is at the file `path`; keeps others away meanwhile."""
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise ReviewError(f"{path} is being written just now: wait until its recorder has ended") from None
+        except OSError:  # a file system without locks
+            pass
+        yield
+
+
+def unused(path: str | Path) -> Path:
+    """`path`, for a recording that is not to go on from another. `FileExistsError` for a folder with parts."""
+    if Path(path).is_dir() and parts(Path(path)):
+        raise FileExistsError(f"{path} holds a recording already: name another file or folder")
+    return Path(path)
+
+
 class Folder:
     """`path` as the folder of a mission that is being recorded, held against other recorders until `close`.
     `OSError` if it cannot be made or another holds it."""
@@ -109,17 +146,21 @@ class Folder:
         rotation = self._rotation
         if not rotation.keeps:
             return
-        old = [path for path in parts(self.path) if path != current]
+        old: list[tuple[Path, os.stat_result]] = []
+        for path in parts(self.path):
+            with contextlib.suppress(FileNotFoundError):  # somebody else has deleted it meanwhile
+                if path != current:
+                    old.append((path, path.stat()))
         if rotation.keep_for is not None:
             oldest = time.time() - rotation.keep_for
-            while old and old[0].stat().st_mtime < oldest:
-                self._delete(old.pop(0), f"ended more than {rotation.keep_for:g} s ago")
+            while old and old[0][1].st_mtime < oldest:
+                self._delete(old.pop(0)[0], f"ended more than {rotation.keep_for:g} s ago")
         if rotation.keep_size is not None:
-            sizes = [path.stat().st_size for path in old]
-            total = sum(sizes) + current.stat().st_size
+            total = sum(said.st_size for _, said in old) + current.stat().st_size
             while old and total > rotation.keep_size:
-                total -= sizes.pop(0)
-                self._delete(old.pop(0), f"the parts are larger than {rotation.keep_size} bytes")
+                path, said = old.pop(0)
+                total -= said.st_size
+                self._delete(path, f"the parts are larger than {rotation.keep_size} bytes")
 
     def make_room(self, current: Path) -> bool:
         """Delete the oldest part for one more on a full disk; whether there was one that may go."""

@@ -81,10 +81,11 @@ def run_recorder(
             path, realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw, rotation=rotation, live=live
         ) as recorder:
             log.info("recording %s/v1/** into %s", realm, path)
-            _loop(inbox, recorder, stop, interval, on_tick or (lambda recorder: None))
+            dropped = _loop(inbox, recorder, stop, interval, on_tick or (lambda recorder: None))
             for declaration in declared:
                 declaration.close()
             _take(inbox, recorder, 0.0)
+            _note_dropped(inbox, recorder, dropped)
     finally:
         for declaration in declared:
             declaration.close()
@@ -96,7 +97,8 @@ def run_recorder(
 
 def _loop(
     inbox: Inbox[Item], recorder: Recorder, stop: threading.Event, interval: float, on_tick: Callable[[Recorder], None]
-) -> None:
+) -> Counter[str]:
+    """Returns what the inbox had dropped, as far as it is noted."""
     due = time.monotonic() + interval
     dropped: Counter[str] = Counter()
     while not stop.is_set():
@@ -104,11 +106,18 @@ def _loop(
         if time.monotonic() < due:
             continue
         due = time.monotonic() + interval
-        before, dropped = dropped, Counter(inbox.dropped)
-        for key, count in (dropped - before).items():
-            recorder.lost(key, count, time.time_ns())
+        dropped = _note_dropped(inbox, recorder, dropped)
         recorder.tick()
         on_tick(recorder)
+    return dropped
+
+
+def _note_dropped(inbox: Inbox[Item], recorder: Recorder, before: Counter[str]) -> Counter[str]:
+    """Note what the inbox has dropped since it had dropped `before`."""
+    dropped = Counter(inbox.dropped)
+    for key, count in (dropped - before).items():
+        recorder.lost(key, count, time.time_ns())
+    return dropped
 
 
 def _take(inbox: Inbox[Item], recorder: Recorder, timeout: float) -> None:

@@ -88,7 +88,7 @@ def _read_parts(folder: Path) -> Iterator[RawMessage]:
                     begun, last = begun or message.received, message.received
                 yield message._replace(arrival=arrival)
                 arrival += 1
-        except ReviewError as error:
+        except (ReviewError, FileNotFoundError) as error:  # the latter: its recorder has deleted it meanwhile
             log.warning("part left out: %s", error)
         if ended and begun and any("resume" in cell for cell in begins):
             log.warning("%s: %.1f s without a recorder before part %d", folder, (begun - ended) / 1e9, number)
@@ -186,6 +186,8 @@ class _TornError(Exception):
 
 def _open(path: Path) -> Any:
     """A reader of `path`."""
+    if not path.is_file():
+        raise FileNotFoundError(f"no recording at {path}")
     import_rerun()
     from rerun.chunk import RrdReader
 

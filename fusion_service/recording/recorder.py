@@ -24,12 +24,12 @@ import uuid
 from collections import Counter
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from fusion_service.errors import ReviewError
 from fusion_service.recording.blueprint import blueprint, track_blueprint
 from fusion_service.recording.columns import Columns, Stamp, entity, import_rerun, raw
-from fusion_service.recording.parts import Folder, Rotation, is_folder, number_of, parts
+from fusion_service.recording.parts import Folder, Rotation, begin, is_folder, number_of, parts
 from fusion_service.recording.reader import recording_id
 from fusion_service.recording.repair import mend
 from fusion_service.recording.scene import MAX_SOURCES, PATIENCE, Scene
@@ -103,6 +103,7 @@ class Recorder:
         self._closed = False
         self._broken = False
         self._stream: Any = None
+        self._writing: BinaryIO | None = None
 
         self._folder: Folder | None = None
         begins = "start"
@@ -111,9 +112,10 @@ class Recorder:
             if self.path.is_file():
                 raise FileExistsError(f"{self.path} is a file: name a folder for the parts")
             self._folder = Folder(self.path, rotation or Rotation())
-            begins = self._resume(self._folder)
-            self.path = self._folder.next()
         try:
+            if self._folder is not None:
+                begins = self._resume(self._folder)
+                self.path = self._folder.next()
             self._open(begins)
             self._raw = Columns(self._stream)
             self._columns = Columns(self._stream, live)
@@ -236,11 +238,7 @@ class Recorder:
     def _open(self, begins: str) -> None:
         """Begin a file at `self.path`. begins: "start", "resume" after a recorder that ended, "rotation"."""
         rr = import_rerun()
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            self.path.open("xb").close()
-        except FileExistsError:
-            raise FileExistsError(f"{self.path} exists already: name another file, or move it away") from None
+        self._writing = begin(self.path)
         stream = rr.RecordingStream(APPLICATION, recording_id=self._id, send_properties=True)
         stream.set_sinks(rr.FileSink(str(self.path)))
         stream.send_recording_name(self.path.stem if self._folder is None else self.path.parent.name)
@@ -290,13 +288,15 @@ class Recorder:
     def _disconnect(self) -> None:
         """Write the index. A stream whose writer has died waits for it for ever, here or when it is deleted or the
         process ends: a thread that sleeps keeps it from being deleted."""
-        if self._stream is None:
-            return
-        if not self._broken:
-            self._stream.disconnect()
-            return
-        import_rerun().unregister_shutdown()
-        threading.Thread(target=lambda _: threading.Event().wait(), args=(self._stream,), daemon=True).start()
+        try:
+            if self._stream is not None and not self._broken:
+                self._stream.disconnect()
+            elif self._stream is not None:
+                import_rerun().unregister_shutdown()
+                threading.Thread(target=lambda _: threading.Event().wait(), args=(self._stream,), daemon=True).start()
+        finally:
+            if self._writing is not None:
+                self._writing.close()
 
     def _say(self, text: str, received: int, level: str = "WARN") -> None:
         self._scene.journal.say("recorder", level, text, Stamp(received, self._scene.now))

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fusion_service.errors import ReviewError
-from fusion_service.recording.parts import parts
+from fusion_service.recording.parts import nobody_writes, parts
 from fusion_service.recording.program import find_program, quiet
 from fusion_service.recording.reader import has_index, read, repair
 
@@ -46,14 +46,15 @@ class Mended:
 
 def mend(path: Path, *, index: bool = True) -> Mended:
     """Make one recording whole, in place. index: also write a missing index. `ReviewError` for a file that holds
-    nothing or is no recording."""
+    nothing, is no recording or is being written."""
     if not path.is_file():
         raise ReviewError(f"no recording at {path}")
-    cut = repair(path)
-    if has_index(path) or not index:
-        return Mended(cut)
-    why_not = _index(path)
-    return Mended(cut, not why_not, why_not)
+    with nobody_writes(path):
+        cut = repair(path)
+        if has_index(path) or not index:
+            return Mended(cut)
+        why_not = _index(path)
+        return Mended(cut, not why_not, why_not)
 
 
 def mend_all(path: Path, stop: Callable[[], bool]) -> Iterator[tuple[Path, Mended | ReviewError]]:

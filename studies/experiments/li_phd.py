@@ -34,7 +34,7 @@ from fusion_service.cells import Components, find_cells, fuse_cells
 from fusion_service.metrics import gospa
 from studies.experiments.li_densities import FIG7
 from studies.pictures import colour
-from studies.statistics import jackknife, mean
+from studies.statistics import jackknife, mean, pooled_rms
 from studies.study import Floats, Result, Row, Run, Study
 
 TARGETS = np.array([20.0, 40.0, 70.0, 110.0, 200.0])
@@ -190,10 +190,6 @@ def rows_of_fig7() -> list[Row]:
     return rows
 
 
-def _rms(samples: Floats) -> float:
-    return float(np.sqrt(samples[0].sum() / max(samples[1].sum(), 1e-9)))
-
-
 def run(run: Run) -> Result:
     counts = [min(CHUNK, run.runs - at) for at in range(0, run.runs, CHUNK)]
     items: list[Item] = [("ours", SENSORS, count, (run.seed, 1, part)) for part, count in enumerate(counts)]
@@ -213,7 +209,9 @@ def run(run: Run) -> Result:
             one = table[r, e]
             name = f"{label}: {rule}"
             rows += [Row(name, measure, None, *mean(one[k])) for k, measure in enumerate(MEASURES[:-1])]
-            rows.append(Row(name, "RMS error of those found", None, *jackknife(_rms, np.stack([one[5], 5 - one[1]]))))
+            rows.append(
+                Row(name, "RMS error of those found", None, *jackknife(pooled_rms, np.stack([one[5], 5 - one[1]])))
+            )
     for e, way in enumerate(READ):
         for r, rule in enumerate(RULES):
             name = f"GOSPA against sensors, {way}: {rule}"

@@ -34,7 +34,7 @@ from fusion_service.config import CentreConfig
 from fusion_service.metrics import gospa
 from sensor_clients.filters import GmPhdFilter, PhdConfig, Position
 from studies.pictures import colour
-from studies.statistics import jackknife, mean
+from studies.statistics import jackknife, mean, pooled_rms
 from studies.study import Floats, Result, Row, Run, Study
 
 SECOND = 10**9
@@ -141,10 +141,6 @@ def independent_loss(N: int) -> float:
     return float(TARGETS * ((1 + 1 / N) ** (-2.0 * (N - 1)) - 1))
 
 
-def _rms(samples: Floats) -> float:
-    return float(np.sqrt(samples[0].sum() / max(samples[1].sum(), 1e-9)))
-
-
 def run(run: Run) -> Result:
     keys = [(run.seed, number) for number in range(run.runs)]
     table = np.stack(run.map(one_run, keys, "runs"), axis=-1)
@@ -156,7 +152,7 @@ def run(run: Run) -> Result:
                 one, name = table[d, six, r, e], f"six sensors, p = {p:g}, {way}: {rule}"
                 rows += [Row(name, measure, None, *mean(one[k])) for k, measure in enumerate(MEASURES[:-1])]
                 found = np.stack([one[5], TARGETS - one[1]])
-                rows.append(Row(name, "RMS error of those found [m]", None, *jackknife(_rms, found)))
+                rows.append(Row(name, "RMS error of those found [m]", None, *jackknife(pooled_rms, found)))
     for quantity, k in (("GOSPA [m]", 0), ("mass - 5", 4)):
         for d, p in enumerate(DETECTIONS):
             for e, way in enumerate(READ[: 1 if k == 4 else 2]):

@@ -203,12 +203,7 @@ def run(run: Run) -> Result:
         parts = [algorithm(run.rng(5, n, i), min(PIECE, M - i), n, aspect, far) for i in range(0, M, PIECE)]
         for variant in parts[0]:
             updates, error = (np.concatenate([part[variant][i] for part in parts]) for i in (0, 1))
-            good = np.isfinite(updates)
-            rows.append(Row(f"{family}: {variant}", "failures, %", None, *percent(~good)))
-            if good.sum() > 1:
-                if updates[good].any():
-                    rows.append(Row(f"{family}: {variant}", "updates where it works", None, *mean(updates[good])))
-                rows.append(Row(f"{family}: {variant}", "largest error where it works", None, float(error[good].max())))
+            rows += uney.search_rows(f"{family}: {variant}", updates, error)
         run.progress(0.3, "algorithm 1")
 
     outcomes: dict[tuple[int, float], Floats] = {}

@@ -39,7 +39,6 @@ from studies import uney
 from studies.pictures import colour
 from studies.statistics import mean, rmse
 from studies.study import Floats, Result, Row, Run, Study
-from studies.uney import percent
 
 SMALL = np.stack([binom.pmf(np.arange(6), 5, P) for P in (0.95, 0.92)])
 LARGE = np.stack([binom.pmf(np.arange(36), 35, P) for P in (0.98, 0.975)])
@@ -215,12 +214,7 @@ def run(run: Run) -> Result:
         rows.append(Row(f"{N} sensors that see 10, EMD", "targets lost (MAP)", None, *mean(lost_targets[N])))
     for family in ("alike", "unlike"):
         for variant, (updates, error) in algorithm(run.rng(2), M, family).items():
-            good = np.isfinite(updates)
-            rows.append(Row(f"{family}: {variant}", "failures, %", None, *percent(~good)))
-            if good.sum() > 1:
-                if updates[good].any():
-                    rows.append(Row(f"{family}: {variant}", "updates where it works", None, *mean(updates[good])))
-                rows.append(Row(f"{family}: {variant}", "largest error where it works", None, float(error[good].max())))
+            rows += uney.search_rows(f"{family}: {variant}", updates, error)
     run.progress(0.3, "algorithm 2")
 
     items = [(n, N) for N in TEAMS for n in NUMBERS]

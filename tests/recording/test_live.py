@@ -110,19 +110,40 @@ def test_a_viewer_that_never_reads_holds_nothing_up(
     assert [raw.data for raw in read(tmp_path / "a.rrd")] == [data for _, data in coded]
 
 
+def is_free(port: int) -> bool:
+    try:
+        socket.create_server((HOST, port)).close()
+    except OSError:
+        return False
+    return True
+
+
 def test_a_port_that_is_taken_is_one_clear_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with socket.create_server((HOST, 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(OSError, match=rf"cannot listen on {HOST}:{port}"):
             Live(HOST, port)
         with pytest.raises(OSError, match=rf"cannot listen on {HOST}:{port}"):
-            Live(HOST, free_port(), web=port)
+            Live(HOST, other := free_port(), web=port)
+        assert is_free(other)  # nothing has been begun
         command = ["record", "--out", str(tmp_path / "a.rrd"), "--live", f"{HOST}:{port}"]
         assert main(command) == 1
     assert len(capsys.readouterr().err.strip().splitlines()) == 1
     assert not (tmp_path / "a.rrd").exists()
     with pytest.raises(OSError, match="no address of this machine"):
         Live("no.such.host.invalid", 1)
+
+
+def test_a_recorder_that_finds_no_bus_takes_its_viewers_server_along(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def none(*_: object, **__: object) -> None:
+        raise OSError("no bus")
+
+    monkeypatch.setattr("fusion_service.bus.open_bus", none)
+    port = free_port()
+    assert main(["record", "--out", str(tmp_path / "a.rrd"), "--live", f"{HOST}:{port}"]) == 1
+    eventually(lambda: is_free(port))
 
 
 @pytest.mark.parametrize(

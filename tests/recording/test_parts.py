@@ -10,7 +10,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from processes import Hub, Program
+from processes import Hub, Program, eventually
 from recording.contents import entities, rows, static
 from recording.mission import RADARS, Sent, mission
 from rerun.chunk import RrdReader
@@ -227,6 +227,50 @@ def test_repair_says_what_it_cannot_mend(tmp_path: Path, capsys: pytest.CaptureF
         mend(tmp_path / "0001.rrd")
 
 
+def test_what_is_being_written_is_not_mended(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Cutting it, or putting a copy in its place, would lose what the recorder writes from then on."""
+    said = list(mission(10))
+    fly(tmp_path, said[:20], Rotation())
+    with Recorder(tmp_path) as recorder:
+        before = recorder.path.stat().st_ino
+        assert main(["repair", str(tmp_path)]) == 1
+        lines = capsys.readouterr().out.splitlines()
+        assert [line.split(": ")[1] for line in lines] == [
+            "whole, nothing to be done",
+            "wait until its recorder has ended",
+        ]
+        for sent in said[20:]:
+            recorder.handle(sent.key, sent.data, sent.received)
+    assert recorder.path.stat().st_ino == before
+    assert [raw.data for raw in read(tmp_path)] == [sent.data for sent in said]
+    assert main(["repair", str(tmp_path)]) == 0
+
+
+def test_a_folder_in_which_no_part_can_be_begun_is_let_go(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(path: Path) -> None:
+        raise OSError("no")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fusion_service.recording.recorder.parts", broken)
+        with pytest.raises(OSError, match="no"):
+            Recorder(tmp_path, rotation=Rotation())
+    with Recorder(tmp_path, rotation=Rotation()) as recorder:
+        assert recorder.path.name == "0001.rrd"
+
+
+def test_a_part_that_goes_while_it_is_read_is_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    said = list(mission(10))
+    fly(tmp_path, said[:20], Rotation())
+    fly(tmp_path, said[20:30], Rotation())
+    fly(tmp_path, said[30:], Rotation())
+    found = read(tmp_path)
+    first = next(found)
+    (tmp_path / "0002.rrd").unlink()
+    with caplog.at_level(logging.WARNING):
+        assert [raw.data for raw in (first, *found)] == [sent.data for sent in (*said[:20], *said[30:])]
+    assert "part left out" in caplog.text
+
+
 # ------------------------------------------------------------------ units and the command line
 
 
@@ -303,13 +347,10 @@ def test_the_process_loses_nothing_when_it_rotates_under_load_and_is_killed(hub:
         Program(LOAD, hub.endpoint, "150", str(Path(__file__).parents[1])) as load,
     ):
         assert load.line(20) == "ready"
-        deadline = time.monotonic() + 20
-        while not (folder.is_dir() and parts(folder)):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
+        eventually(lambda: folder.is_dir() and parts(folder), 20)
         load.tell()
         assert load.line(30) == "done"
-        time.sleep(1.0)
+        eventually(lambda: sum(1 for _ in read(folder)) == len(said), 20)
         recorder.signal(signal.SIGKILL)
         recorder.kill()
     found = list(read(folder))
@@ -319,11 +360,7 @@ def test_the_process_loses_nothing_when_it_rotates_under_load_and_is_killed(hub:
     assert all(a.received <= b.received for a, b in pairwise(found) if a.key == b.key)
     count = len(parts(folder))
     with Program(run) as recorder, open_bus([hub.endpoint], wait=10):
-        deadline = time.monotonic() + 20
-        while len(parts(folder)) == count:
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-        time.sleep(0.3)
+        eventually(lambda: len(parts(folder)) > count, 20)
         recorder.signal(signal.SIGTERM)
         assert recorder.end()[0] == 0
     assert [raw.data for raw in read(folder)][: len(found)] == [raw.data for raw in found]

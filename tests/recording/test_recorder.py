@@ -5,9 +5,12 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import threading
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import missions
 import numpy as np
@@ -17,8 +20,8 @@ from recording.contents import entities, key_of, record, rows, texts
 from recording.mission import START, Sent, mission
 from rerun.chunk import RrdReader
 
-from fusion_service.bus import open_bus
-from fusion_service.recording import RawMessage, Recorder, default_path, messages, read, repair
+from fusion_service.bus import Bus, open_bus
+from fusion_service.recording import RawMessage, Recorder, default_path, messages, read, repair, run_recorder
 from schemas import Message, encode, local_key
 
 SECOND = 10**9
@@ -214,6 +217,30 @@ def test_a_recorder_that_is_killed_or_stopped_leaves_all_it_wrote(
         assert [raw.data for raw in found if raw.key == key] == [data for name, data in said if name == key]
     if end == signal.SIGTERM:
         assert any("left the bus" in text for text in texts(path, "sources"))
+
+
+class Flood:
+    """A bus on which three messages come at once, before anybody takes one."""
+
+    def watch(self, key: str, put: Callable[..., None]) -> Flood:
+        return self
+
+    def subscribe(self, key: str, put: Callable[..., None], on_miss: Callable[..., None]) -> Flood:
+        for sent in list(mission(1))[:3]:
+            put("fusion/v1/local/a/tracks", sent.data)
+        return self
+
+    def close(self) -> None:
+        pass
+
+
+def test_what_is_dropped_just_before_the_end_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fusion_service.recording.process.CAPACITY", 1)
+    stop = threading.Event()
+    stop.set()
+    recorder = run_recorder(cast(Bus, Flood()), tmp_path / "a.rrd", stop=stop)
+    assert recorder.messages == 1
+    assert any("2 messages on fusion/v1/local/a/tracks were lost" in text for text in texts(recorder.path, "recorder"))
 
 
 # ------------------------------------------------------------------ it keeps up

@@ -10,7 +10,7 @@ import pytest
 from studies import report
 from studies.cli import main
 from studies.rules import fuser
-from studies.study import Row, catalogue
+from studies.study import Result, Row, Run, catalogue
 
 COUNTER = "sharma-counter-example"
 
@@ -62,6 +62,18 @@ def test_bad_usage_is_told_in_a_line(arguments: list[str], word: str, capsys: py
         main(arguments)
     assert ended.value.code == 2
     assert word in capsys.readouterr().err
+
+
+def test_a_bar_in_a_name_does_not_end_its_cell(tmp_path: Path) -> None:
+    study = catalogue()[COUNTER]
+    wide = [Row("most |e|", f"|number - {k}|", None, 1.0) for k in range(study.widest + 1)]
+    for rows in (wide, wide[:2]):
+        result = Result(tuple(rows))
+        report.write_json(tmp_path / f"{COUNTER}.json", report.as_json(study, Run(1), result))
+        lines = [line for line in report.page([study], tmp_path).splitlines() if line.startswith("|")]
+        table = lines[lines.index(next(line for line in lines if line.startswith("| | ") and COUNTER not in line)) :]
+        assert r"most \|e\|" in table[2]
+        assert len({line.replace(r"\|", "").count("|") for line in table}) == 1
 
 
 def test_rules_are_named_with_their_options() -> None:
