@@ -6,13 +6,14 @@ All have one recording id, so that `rerun DIR/*.rrd` shows them as one. A folder
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import logging
 import os
 import re
 import time
 from dataclasses import dataclass
 from pathlib import Path
+
+from fusion_service.recording.holding import hold
 
 __all__ = ["DEFAULT_SIZE", "Folder", "Rotation", "is_folder", "number_of", "parts"]
 
@@ -80,11 +81,9 @@ class Folder:
         self.path = path
         self._rotation = rotation
         path.mkdir(parents=True, exist_ok=True)
-        self._lock = os.open(path, os.O_RDONLY)
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            self._lock = hold(path)
         except OSError:
-            os.close(self._lock)
             raise OSError(f"{path} is being recorded into by another process: name another folder") from None
         self._began = 0.0
 

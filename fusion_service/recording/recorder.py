@@ -16,7 +16,9 @@ file, and the series of the charts, end with a part: a recording of weeks takes 
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
 import shutil
 import threading
 import time
@@ -29,6 +31,7 @@ from typing import TYPE_CHECKING, Any
 from fusion_service.errors import ReviewError
 from fusion_service.recording.blueprint import blueprint, track_blueprint
 from fusion_service.recording.columns import Columns, Stamp, entity, import_rerun, raw
+from fusion_service.recording.holding import hold
 from fusion_service.recording.parts import Folder, Rotation, is_folder, number_of, parts
 from fusion_service.recording.reader import recording_id
 from fusion_service.recording.repair import mend
@@ -103,6 +106,7 @@ class Recorder:
         self._closed = False
         self._broken = False
         self._stream: Any = None
+        self._held: int | None = None
 
         self._folder: Folder | None = None
         begins = "start"
@@ -243,6 +247,8 @@ class Recorder:
             raise FileExistsError(f"{self.path} exists already: name another file, or move it away") from None
         stream = rr.RecordingStream(APPLICATION, recording_id=self._id, send_properties=True)
         stream.set_sinks(rr.FileSink(str(self.path)))
+        with contextlib.suppress(OSError):  # a disk that cannot hold a file: `repair` cannot ask then
+            self._held = hold(self.path)
         stream.send_recording_name(self.path.stem if self._folder is None else self.path.parent.name)
         stream.send_property("part", rr.AnyValues(number=number_of(self.path) or 0, begins=begins))
         self._stream = stream
@@ -294,6 +300,10 @@ class Recorder:
             return
         if not self._broken:
             self._stream.disconnect()
+        if self._held is not None:
+            os.close(self._held)
+            self._held = None
+        if not self._broken:
             return
         import_rerun().unregister_shutdown()
         threading.Thread(target=lambda _: threading.Event().wait(), args=(self._stream,), daemon=True).start()

@@ -7,6 +7,7 @@ number of messages. A file without an index opens as well, only more slowly.
 
 from __future__ import annotations
 
+import contextlib
 import logging
 import os
 import shutil
@@ -17,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fusion_service.errors import ReviewError
+from fusion_service.recording.holding import hold
 from fusion_service.recording.parts import parts
 from fusion_service.recording.program import find_program, quiet
 from fusion_service.recording.reader import has_index, read, repair
@@ -46,14 +48,21 @@ class Mended:
 
 def mend(path: Path, *, index: bool = True) -> Mended:
     """Make one recording whole, in place. index: also write a missing index. `ReviewError` for a file that holds
-    nothing or is no recording."""
+    nothing, is no recording, or is being written by a recorder."""
     if not path.is_file():
         raise ReviewError(f"no recording at {path}")
-    cut = repair(path)
-    if has_index(path) or not index:
-        return Mended(cut)
-    why_not = _index(path)
-    return Mended(cut, not why_not, why_not)
+    with contextlib.ExitStack() as stack:
+        try:
+            stack.callback(os.close, hold(path))
+        except BlockingIOError:
+            raise ReviewError(f"{path} is being recorded: end its recorder first") from None
+        except OSError as error:
+            log.debug("%s cannot be held: %s", path, error)
+        cut = repair(path)
+        if has_index(path) or not index:
+            return Mended(cut)
+        why_not = _index(path)
+        return Mended(cut, not why_not, why_not)
 
 
 def mend_all(path: Path, stop: Callable[[], bool]) -> Iterator[tuple[Path, Mended | ReviewError]]:
