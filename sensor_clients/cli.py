@@ -151,7 +151,9 @@ def _playback(arguments: argparse.Namespace) -> int:
 def _publish(scenario: Scenario, arguments: argparse.Namespace, seed: int, lineage: Sequence[str] | None = None) -> int:
     sensor = arguments.sensor
     if sensor != "truth" and sensor not in scenario.sensors:
-        raise UsageError(f"no sensor {sensor!r} in {scenario.name}; known: {', '.join(scenario.sensors)}, truth")
+        raise UsageError(
+            f"no sensor {sensor!r} in {scenario.name}; known: {', '.join([*filter(None, scenario.sensors), 'truth'])}"
+        )
     try:
         check_realm(arguments.realm)
     except ValueError as error:

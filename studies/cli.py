@@ -12,7 +12,7 @@ from pathlib import Path
 
 from fusion_service.progress import Progress
 from studies import pictures, report
-from studies.rules import fuser
+from studies.rules import OwnRuleError, fuser
 from studies.study import MissingDataError, Result, Run, Study, catalogue
 
 __all__ = ["main"]
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     every.add_argument("--out", type=Path, default=report.FOLDER, metavar="DIR", help="(default %(default)s)")
     for command in (one, every):
         command.add_argument("--quick", action="store_true", help="as few runs as in CI")
-        command.add_argument("--seed", type=int, default=1, metavar="S", help="(default %(default)s)")
+        command.add_argument("--seed", type=_seed, default=1, metavar="S", help="(default %(default)s)")
         command.add_argument("--jobs", type=_count, default=os.cpu_count() or 1, metavar="N", help="processes")
         command.add_argument(
             "--data", type=Path, default=os.environ.get("FUSION_DATA"), metavar="DIR", help="Autoferry's folder"
@@ -70,11 +70,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     study = known[args.name]
     if args.rule and not study.takes_rules:
         parser.error(f"{study.name} compares no rules: --rule has no effect on it")
+    for path in filter(None, (args.json, args.png)):
+        if path.is_dir() or not path.parent.is_dir():
+            parser.error(f"cannot write {path}: name a file in a folder that exists")
+    if args.png and args.png.suffix != ".png":
+        parser.error(f"cannot draw {args.png}: name a .png file")
     try:
         run = replace(run, rules=tuple(fuser(text) for text in args.rule))
     except ValueError as error:
         parser.error(str(error))
     return _run(study, replace(run, runs=args.runs or _runs(study, args.quick)), args.json, args.png)
+
+
+def _seed(text: str) -> int:
+    value = int(text)
+    if value < 0:
+        raise argparse.ArgumentTypeError(f"{value}: at least 0")
+    return value
 
 
 def _count(text: str) -> int:
@@ -114,7 +126,7 @@ def _run(study: Study, run: Run, json_path: Path | None, png: Path | None) -> in
             report.write_json(json_path, values)
         if png and result.draw:
             pictures.save(result.draw, result.size, png)
-    except (MissingDataError, OSError) as error:
+    except (MissingDataError, OwnRuleError, OSError) as error:
         print(f"{study.name}: {error}", file=sys.stderr)
         return 1
     print(f"\n{_duration(time.monotonic() - began)}" + (f", {png}" if png else ""), file=sys.stderr)

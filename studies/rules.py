@@ -18,9 +18,13 @@ from numpy.typing import NDArray
 from fusion_service.rules import RULES, RuleError, fuse_last
 from fusion_service.rules.face import Fused
 
-__all__ = ["Fuser", "fuser"]
+__all__ = ["Fuser", "OwnRuleError", "fuser"]
 
 Floats = NDArray[np.float64]
+
+
+class OwnRuleError(Exception):
+    """A rule of the user's own failed or gave something else than a mean and a covariance; one line."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +47,14 @@ class Fuser:
     def __call__(self, means: Floats, covariances: Floats) -> Fused:
         """Fuse means (N, n, B) and covariances (N, n, n, B): mean (n, B), covariance (n, n, B), weights (N, B)."""
         if self.function is not None:
-            mean, covariance = self.function(means, covariances)
+            try:
+                mean, covariance = map(np.asarray, self.function(means, covariances))
+            except Exception as error:
+                raise OwnRuleError(f"rule {self.text}: {type(error).__name__}: {error}") from error
+            wanted = means.shape[1:], covariances.shape[1:]
+            if (mean.shape, covariance.shape) != wanted:
+                got = f"{mean.shape} and {covariance.shape}, not {wanted[0]} and {wanted[1]}"
+                raise OwnRuleError(f"rule {self.text}: gives mean and covariance of shape {got}")
             return Fused(mean, covariance, np.full(means[:, 0].shape, np.nan), None)
         N, _, B = means.shape
         weights = np.full((N, B), 1.0 / N) if self.weights == "uniform" else None
@@ -89,7 +100,10 @@ def _own(path: Path, name: str) -> Fuser:
     if spec is None or spec.loader is None or not path.is_file():
         raise ValueError(f"no file {path} to take a rule from")
     module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise ValueError(f"{path} cannot be run: {type(error).__name__}: {error}") from None
     function = getattr(module, name, None)
     if not callable(function):
         raise ValueError(f"{path} has no function {name!r}: write {path}:FUNCTION")

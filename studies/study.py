@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib
 import multiprocessing
 import pkgutil
+import signal
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field
@@ -84,7 +85,8 @@ class Run:
                 answers.append(function(item))
                 self.progress(len(answers) / len(work), note)
             return answers
-        with ProcessPoolExecutor(self.jobs, multiprocessing.get_context("spawn")) as pool:
+        spawn, ignore = multiprocessing.get_context("spawn"), (signal.SIGINT, signal.SIG_IGN)
+        with ProcessPoolExecutor(self.jobs, spawn, initializer=signal.signal, initargs=ignore) as pool:
             try:
                 for answer in pool.map(function, work):
                     answers.append(answer)

@@ -231,6 +231,8 @@ def test_what_cannot_be_evaluated_is_told_in_one_line(
     short = tmp_path / "short.csv"
     export(flown, short, "truth")
     short.write_text(short.read_text().replace(",circles,truth,1,", ",circles,truth,one,", 1))
+    cut = tmp_path / "cut.csv"
+    cut.write_text("\n".join(short.read_text().splitlines()[:4]).rpartition(",")[0])
     none = tmp_path / "none.csv"
     none.write_text((short.read_text().splitlines() or [""])[0] + "\n")
     for arguments, says in (
@@ -243,7 +245,10 @@ def test_what_cannot_be_evaluated_is_told_in_one_line(
         ([flown, "--truth", short], "a row of truth is not as it must be"),
         ([flown, "--truth", none], "holds no truth"),
         ([flown, "--truth", no], "is not a recording"),
+        ([flown, "--truth", cut], "line 4 has not as many fields as the first"),
         ([flown, "--html", tmp_path / "gone" / "page.html"], "in a folder that exists"),
+        ([flown, "--json", flown], "is what is read"),
+        ([flown, "--truth", cut, "--html", cut], "is what is read"),
     ):
         assert main(["evaluate", *map(str, arguments)]) == 1, says
         error = capsys.readouterr().err

@@ -245,6 +245,7 @@ def test_what_the_command_cannot_do_is_told(joined: tuple[Path, Flight], tmp_pat
         (["--track", "77"], "has no track 77: it has 3, from 1 to 3"),
         (["--track", "1", "--centre", "nobody"], "holds no centre 'nobody': name one of its centres (centre)"),
         (["--track", "1", "--out", path], "exists already"),
+        (["--track", "1", "--out", str(tmp_path)], "exists already"),
     ):
         assert main(["explain", path, *arguments]) == 1
         errors = capsys.readouterr().err

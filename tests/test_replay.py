@@ -416,7 +416,10 @@ def test_mistakes_are_told_before_anything_is_written(mission: Path, tmp_path: P
         ([], 1, "nothing to do"),
         (["--verify", "--rule", "ci"], 1, "leave out --rule"),
         (["--out", str(mission)], 1, "exists already"),
-        (["--out", str(mission.parent / "parts")], 1, "holds a recording already"),
+        (["--out", str(mission.parent / "parts")], 1, "exists already"),
+        (["--out", str(mission.parent)], 1, "exists already"),
+        (["--verify", "--json", str(mission)], 1, "is what is read"),
+        (["--verify", "--json", str(tmp_path / "gone" / "r.json")], 1, "in a folder that exists"),
         (["--out", str(out), "--config", "nowhere.toml"], 2, "cannot be read"),
         (["--out", str(out), "--centre", "nobody"], 1, "holds no centre 'nobody'"),
     ]

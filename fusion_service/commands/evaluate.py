@@ -47,11 +47,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.evaluation.results import results, text
     from fusion_service.evaluation.truth import read_truth
+    from fusion_service.outputs import check_page
 
-    pages = [Path(name) for name in (args.json, args.html) if name]
-    for page in pages:
-        if page.is_dir() or not page.parent.is_dir():
-            raise ReviewError(f"cannot write {page}: name a file in a folder that exists")
+    for page in filter(None, (args.json, args.html)):
+        check_page(page, *args.recordings, *filter(None, [args.truth]))
     _need_rerun()
     if args.html:
         from fusion_service.evaluation.report import need_matplotlib

@@ -19,8 +19,11 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.recording.repair import mend_all
 
     failed = 0
+    alone = not Path(args.recording).is_dir()
     for path, done in mend_all(Path(args.recording), stop.is_set):
+        if alone and isinstance(done, ReviewError):
+            raise done
         failed += isinstance(done, ReviewError)
         print(f"{done}" if isinstance(done, ReviewError) else f"{path}: {done}", flush=True)
     if failed:
-        raise ReviewError(f"{failed} of what is there could not be made whole: move it away")
+        raise ReviewError(f"{failed} of what is there could not be made whole: see above")

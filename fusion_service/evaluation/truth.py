@@ -53,6 +53,8 @@ def _csv(path: Path) -> Iterator[Columns]:
         wanted = _wanted(tuple(reader.fieldnames or ()), path)
         table: Columns = {name: [] for name in wanted}
         for row in reader:
+            if None in row or None in row.values():
+                raise ReviewError(f"{path}: line {reader.line_num} has not as many fields as the first: mend it")
             if row["kind"] == "truth":
                 for name in wanted:
                     table[name].append(row[name])

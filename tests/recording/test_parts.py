@@ -271,6 +271,36 @@ def test_a_part_that_goes_while_it_is_read_is_left_out(tmp_path: Path, caplog: p
     assert "part left out" in caplog.text
 
 
+def test_repair_leaves_what_is_being_recorded(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The index is written into a copy that takes the file's place: a running recorder would go on in the old one."""
+    said = list(mission(3))
+    path = tmp_path / "mission.rrd"
+    with Recorder(path) as recorder:
+        for number, sent in enumerate(said):
+            recorder.handle(sent.key, sent.data, sent.received)
+            if number == len(said) // 2:
+                recorder.tick()
+                assert main(["repair", str(path)]) == 1
+                assert capsys.readouterr().err.count("wait until its recorder has ended") == 1
+    assert len(list(read(path))) == len(said)
+    assert main(["repair", str(path)]) == 0
+
+
+def test_a_part_is_free_once_the_next_has_begun(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    with Recorder(tmp_path, rotation=Rotation(size=10_000)) as recorder:
+        for number, sent in enumerate(mission(20)):
+            recorder.handle(sent.key, sent.data, sent.received)
+            if number % 20 == 0:
+                recorder.tick()
+        there = parts(tmp_path)
+        assert len(there) > 1
+        assert main(["repair", str(tmp_path)]) == 1
+        told = capsys.readouterr().out.splitlines()
+    assert [line.endswith("wait until its recorder has ended") for line in told] == [
+        path == there[-1] for path in there
+    ]
+
+
 # ------------------------------------------------------------------ units and the command line
 
 

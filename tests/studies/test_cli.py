@@ -55,6 +55,9 @@ def test_a_rule_of_ones_own_joins_the_experiment(tmp_path: Path, capsys: pytest.
         (["run", COUNTER, "--rule", "ci:criterion=size"], "det"),
         (["run", COUNTER, "--rule", "missing.py:fuse"], "no file"),
         (["run", COUNTER, "--runs", "0"], "at least 1"),
+        (["run", COUNTER, "--seed", "-1"], "at least 0"),
+        (["run", COUNTER, "--json", "no-such/x.json"], "in a folder that exists"),
+        (["run", COUNTER, "--png", "x.xyz"], "name a .png file"),
     ],
 )
 def test_bad_usage_is_told_in_a_line(arguments: list[str], word: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -74,6 +77,27 @@ def test_a_bar_in_a_name_does_not_end_its_cell(tmp_path: Path) -> None:
         table = lines[lines.index(next(line for line in lines if line.startswith("| | ") and COUNTER not in line)) :]
         assert r"most \|e\|" in table[2]
         assert len({line.replace(r"\|", "").count("|") for line in table}) == 1
+
+
+@pytest.mark.parametrize(
+    ("body", "code", "words"),
+    [
+        ("def fuse(means, covariances): raise KeyError('x')", 1, "own.py:fuse: KeyError: 'x'"),
+        ("def fuse(means, covariances): return 3", 1, "own.py:fuse: TypeError"),
+        ("def fuse(means, covariances): return means, covariances", 1, "gives mean and covariance of shape"),
+        ("def fuse(:", 2, "own.py cannot be run: SyntaxError"),
+    ],
+)
+def test_a_rule_of_ones_own_that_fails_is_told_in_a_line(
+    body: str, code: int, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "own.py").write_text(body)
+    try:
+        ended = main(["run", COUNTER, "--runs", "100", "--rule", f"{tmp_path / 'own.py'}:fuse"])
+    except SystemExit as error:
+        ended = int(error.code or 0)
+    assert ended == code
+    assert words in capsys.readouterr().err
 
 
 def test_rules_are_named_with_their_options() -> None:
