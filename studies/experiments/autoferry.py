@@ -8,10 +8,10 @@ its dimension, 2) of the pairs it assigns, identity switches; the mean over the 
 local tracks only, fused anew at every step; recursive: their result is fused with the predicted last one, by CI with
 weights by det whatever the rule is.
 
-No chance is in it. The errors given are those of the mean as if the five scenes were drawn from many like them
-(jackknife, one scene left out at a time). Scenes differ far more than rules do, so rules are compared on the same
-scenes: "beside ci" is the mean difference of GOSPA to `ci restart`, with its own error. With five scenes a difference
-is significant (5 %) beyond 2.8 of its errors, and of thirty that mean nothing one or two will look so.
+No chance is in it, so the numbers have no error. "beside ci" is the mean difference of GOSPA to `ci restart` on the
+same scenes; its error is that of the mean as if the five scenes were drawn from many like them (jackknife, one scene
+left out at a time). With five scenes a difference is significant (5 %) beyond 2.8 of its errors, and of thirty that
+mean nothing one or two will look so.
 
 Read it with care: the local trackers were tuned on these same five scenarios under `ci`, and there are no others to
 test on. Lidar and radar share the own ship's navigation, so their errors are correlated to an unknown degree. The
@@ -94,7 +94,7 @@ def run(run: Run) -> Result:
     labels = [*SENSORS, *(f"{rule.label} {memory}" for rule, memory in ways)]
     rows = []
     for label, score in zip(labels, scores, strict=True):
-        rows += [Row(label, name, None, *over(one)) for name, one in zip(QUANTITIES, score, strict=True)]
+        rows += [Row(label, name, None, float(one.mean())) for name, one in zip(QUANTITIES, score, strict=True)]
         rows.insert(-len(QUANTITIES) + 1, Row(label, BESIDE, None, *over(score[0] - scores[CI, 0])))
         rows += [Row(label, f"GOSPA {number}", None, float(one)) for number, one in zip(numbers, score[0], strict=True)]
     gospa = dict(zip(labels, scores[:, 0], strict=True))

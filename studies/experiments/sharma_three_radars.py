@@ -344,7 +344,7 @@ STUDIES = (
         run=run,
         runs=200,
         quick=2,
-        seconds=900.0,
+        seconds=800.0,
         takes_rules=True,
     ),
 )
