@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.evaluation import METRICS, evaluate
+from fusion_service.review.evaluation import METRICS, evaluate
 from schemas import LocalTracks, Message, Motion, SensorInfo, Truth
 from sensor_clients.events import Event
 from sensor_clients.playback import autoferry

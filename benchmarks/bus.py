@@ -26,7 +26,7 @@ import zenoh
 from numpy.typing import NDArray
 
 from fusion_service.bus import Inbox, open_bus
-from fusion_service.hub import run_hub
+from fusion_service.bus.hub import run_hub
 
 SECONDS = 1.0
 ROUNDS = 3

@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.evaluation import assess
-from fusion_service.evaluation.logbook import Logbook
-from fusion_service.evaluation.results import text
 from fusion_service.recording import Recorder
+from fusion_service.review.evaluation import assess
+from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.evaluation.results import text
 from schemas import (
     Decisions,
     Entry,
@@ -110,7 +110,7 @@ def write(path: Path, seconds: int, targets: int) -> None:
 
 def score(path: Path, profiled: bool) -> None:
     """Score it, and print how long each part took, and the memory."""
-    from fusion_service.evaluation.report import report
+    from fusion_service.review.evaluation.report import report
 
     profile = cProfile.Profile()
     if profiled:

@@ -14,9 +14,8 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
-from fusion_service import units
-from fusion_service.commands import COMMANDS
-from fusion_service.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.commands import COMMANDS, units
 from fusion_service.process import set_up_logging, stop_on_signals
 
 __all__ = ["main"]
@@ -204,7 +203,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _hub(args: argparse.Namespace, stop: threading.Event) -> None:
-    from fusion_service.hub import run_hub
+    from fusion_service.bus.hub import run_hub
 
     run_hub(args.listen or [DEFAULT_ENDPOINT], stop)
 
@@ -212,7 +211,7 @@ def _hub(args: argparse.Namespace, stop: threading.Event) -> None:
 def _run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.bus import open_bus
     from fusion_service.config import ServiceConfig, load_config
-    from fusion_service.daemon import run_service
+    from fusion_service.service.daemon import run_service
 
     config = load_config(args.config) if args.config else ServiceConfig()
     if args.connect:
@@ -324,7 +323,7 @@ def _call(args: argparse.Namespace, stop: threading.Event) -> int:
     from fusion_service.config import ConfigError
     from fusion_service.demo import DemoError
     from fusion_service.errors import ReviewError
-    from fusion_service.state import StateError
+    from fusion_service.service.state import StateError
 
     try:
         (HERE.get(args.command) or args.call)(args, stop)

@@ -24,9 +24,9 @@ from typing import Any
 
 from fusion_service.bus import open_bus
 from fusion_service.config import centre_config, load_config
+from fusion_service.config.settings import change, merge
+from fusion_service.config.toml_text import dotted, toml_value
 from fusion_service.progress import Progress
-from fusion_service.settings import change, merge
-from fusion_service.toml_text import dotted, toml_value
 from schemas import GlobalTracks, MessageError, decode, global_key, local_key
 
 __all__ = ["DemoError", "run_demo"]
@@ -275,9 +275,9 @@ def _wait(ready: Any, crew: Crew, stop: threading.Event) -> None:
 
 
 def _report(mission: Mission, rule: str, recording: Path, folder: Path, json_path: Path | None) -> dict[str, Any]:
-    from fusion_service.evaluation import evaluate, format_table
-    from fusion_service.picture import mission_map
     from fusion_service.recording import messages
+    from fusion_service.review.evaluation import evaluate, format_table
+    from fusion_service.review.mission_map import mission_map
 
     everything = messages(recording)
     scores = evaluate(everything, c=mission.cutoff, every=mission.every)

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import linalg
-from .densities import chernoff_discrete
-from .linalg import FloatArray
+from fusion_service import linalg
+from fusion_service.densities import chernoff_discrete
+from fusion_service.linalg import FloatArray
 
 __all__ = [
     "ExistenceError",

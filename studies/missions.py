@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import schemas
-from fusion_service.centre import FusionCentre
-from fusion_service.clock import MessageClock
+from fusion_service.centre import FusionCentre, MessageClock
 from fusion_service.metrics import gospa, nees, nees_bounds
 from schemas import GlobalTracks, LocalTracks, SensorInfo, Truth
 from sensor_clients.events import Event, Scenario

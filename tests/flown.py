@@ -12,9 +12,8 @@ import numpy as np
 from centre.worlds import SECOND, START, info, moved, seen, tracks, truth
 
 import schemas
-from fusion_service.centre import FusionCentre, Order, SourceFound, SourceLost, StepResult
+from fusion_service.centre import FusionCentre, IntensityCentre, Order, SourceFound, SourceLost, StepResult
 from fusion_service.config import centre_config
-from fusion_service.intensity import IntensityCentre
 from fusion_service.recording import RawMessage, Recorder, read
 
 SOURCES = ("r1", "r2", "r3")

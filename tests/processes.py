@@ -14,7 +14,7 @@ from typing import Self
 
 HUB = """
 import sys, threading
-from fusion_service.hub import run_hub
+from fusion_service.bus.hub import run_hub
 stop = threading.Event()
 threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
 run_hub([sys.argv[1]], stop)

@@ -11,8 +11,9 @@ from collections.abc import Iterator
 import pytest
 from processes import Hub, Program, eventually, free_endpoint
 
-from fusion_service.bus import HANDSHAKE, Bus, BusError, BusStopped, Inbox, open_bus
-from fusion_service.hub import run_hub
+from fusion_service.bus import Bus, BusError, BusStopped, Inbox, open_bus
+from fusion_service.bus.hub import run_hub
+from fusion_service.bus.session import HANDSHAKE
 from schemas import MAX_BYTES
 
 SUBSCRIBER = """
@@ -310,7 +311,7 @@ def test_what_is_too_long_is_refused_and_from_others_not_delivered(
         publisher.put(bytes(MAX_BYTES + 1))
     publisher.put(bytes(10**6))
     eventually(lambda: got == [10**6])
-    monkeypatch.setattr("fusion_service.bus.MAX_BYTES", 2**40)
+    monkeypatch.setattr("fusion_service.bus.session.MAX_BYTES", 2**40)
     publisher.put(bytes(3 * MAX_BYTES))
     publisher.put(b"after")
     eventually(lambda: got[-1:] == [5], 20)
@@ -365,7 +366,7 @@ class TestJoining:
     def test_waits_for_a_hub_that_comes_later_and_says_so(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("fusion_service.bus.FIRST", 0.3)
+        monkeypatch.setattr("fusion_service.bus.session.FIRST", 0.3)
         hub = Hub()
         timer = threading.Timer(0.6, hub.start)
         timer.start()

@@ -18,10 +18,10 @@ from recording.mission import START, Sent, mission
 
 from fusion_service.cli import main
 from fusion_service.commands import evaluate as command
-from fusion_service.evaluation import assess, evaluate
-from fusion_service.evaluation.logbook import Logbook
-from fusion_service.export import export
 from fusion_service.recording import Recorder, messages
+from fusion_service.review.evaluation import assess, evaluate
+from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.export import export
 from schemas import Entry, GlobalTracks, StepLog, Truth, digest, global_key
 
 CUTOFF, STEPS = 500.0, 100

@@ -13,8 +13,8 @@ import pymap3d
 import pytest
 from missions import FRAME, START, at, info, picture, tracks, truth
 
-from fusion_service.evaluation import METRICS, evaluate, format_table
 from fusion_service.metrics import gospa, ospa
+from fusion_service.review.evaluation import METRICS, evaluate, format_table
 from schemas import Disk, Ecef, Enu, Local, Message, Truth
 
 SEED = 20250705

@@ -17,8 +17,8 @@ import schemas
 from fusion_service.centre import Order
 from fusion_service.cli import main
 from fusion_service.errors import ReviewError
-from fusion_service.explain import explanation, listing, read_mission
-from fusion_service.recording.labels import Labels
+from fusion_service.recording.drawing.labels import Labels
+from fusion_service.review.explain import explanation, listing, read_mission
 from schemas import GlobalTracks, LocalTracks, StepLog, Truth
 
 GATE, KEEP = (f"{chi2.ppf(p, 4):.1f}" for p in (0.999, 0.9999))

@@ -16,8 +16,8 @@ from fusion_service import geodesy
 from fusion_service.bus import open_bus
 from fusion_service.cli import main
 from fusion_service.errors import ReviewError
-from fusion_service.export import export
 from fusion_service.recording import Recorder
+from fusion_service.review.export import export
 from schemas import Enu, GlobalTracks, Height, LocalTracks, Message, Truth
 from schemas.flat import frame_of, frame_text, space_of, track_columns
 from sensor_clients.playback import table

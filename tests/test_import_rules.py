@@ -84,7 +84,7 @@ def test_the_reader_of_imports_reads_them() -> None:
     source = "import a.b as c\nfrom d import e\nfrom . import f\nfrom ..g import h\ndef k():\n  import m"
     assert set(imports(source, "p.q.r")) == {"a.b", "d", "d.e", "p.q", "p.q.f", "p.g", "p.g.h", "m"}
     assert set(imports("from .x import y", "p.q", is_package=True)) == {"p.q.x", "p.q.x.y"}
-    assert set(imports("from fusion_service import bus", "p")) == {"fusion_service.bus"}
+    assert set(imports("from fusion_service import bus", "p")) == {"fusion_service.bus.session"}
     assert set(imports("importlib.import_module('zenoh')\nimportlib.import_module(x)", "p")) == {"zenoh", "?"}
     assert {"schemas.codec", "schemas.keys"} <= set(MODULES)
     assert "msgpack" in IMPORTS["schemas.codec"]
@@ -127,15 +127,15 @@ def test_what_is_installed_stands_without_studies_benchmarks_and_tests() -> None
 @pytest.mark.parametrize("name", ["centre", "association", "lifecycle"])
 def test_the_centre_knows_no_bus(name: str) -> None:
     """Neither directly nor through what it imports."""
-    outside = {"fusion_service.bus", "fusion_service.daemon", "zenoh"}
+    outside = {"fusion_service.bus.session", "fusion_service.service.daemon", "zenoh"}
     assert [found for found in sorted(reach(f"fusion_service.{name}")) if below(found, outside)] == []
 
 
 def test_daemon_knows_no_mathematics() -> None:
     mathematics = {f"fusion_service.{name}" for name in ("linalg", "densities", "rules", "association", "existence")}
-    assert breaches({"fusion_service.daemon"}, mathematics | {"numpy.linalg", "scipy"}) == []
+    assert breaches({"fusion_service.service.daemon"}, mathematics | {"numpy.linalg", "scipy"}) == []
     for module, path in MODULES.items():
-        if below(module, {"fusion_service.daemon"}):
+        if below(module, {"fusion_service.service.daemon"}):
             attributes = {n.attr for n in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(n, ast.Attribute)}
             assert "linalg" not in attributes
 
@@ -149,7 +149,7 @@ def test_nothing_imports_cli() -> None:
 
 def test_only_the_bus_imports_zenoh() -> None:
     users = {module for module, names in IMPORTS.items() if any(below(name, {"zenoh"}) for name in names)}
-    assert users <= {"fusion_service.bus"}
+    assert users <= {"fusion_service.bus.session"}
 
 
 def test_only_recording_imports_rerun() -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import settings
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from fusion_service.inbox import Inbox
+from fusion_service.bus.inbox import Inbox
 
 SLOT = 10
 

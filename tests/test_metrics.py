@@ -10,8 +10,8 @@ from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from fusion_service import metrics
-from fusion_service.evaluation.continuity import Following, Moment, ospa2, siap_of
 from fusion_service.metrics import gospa, identity_switches, near_pairs, nees, nees_bounds, ospa
+from fusion_service.review.evaluation.continuity import Following, Moment, ospa2, siap_of
 
 Array = NDArray[np.float64]
 SEED = 20250704

@@ -14,8 +14,8 @@ import pytest
 from missions import picture, truth
 from numpy.typing import NDArray
 
-from fusion_service.evaluation import Evaluation, evaluate
 from fusion_service.metrics import gospa, ospa
+from fusion_service.review.evaluation import Evaluation, evaluate
 from schemas import Message
 
 pytest.importorskip("stonesoup", reason="the extra oracle")

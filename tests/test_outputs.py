@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fusion_service.errors import ReviewError
-from fusion_service.outputs import check_page, check_recording
+from fusion_service.review.outputs import check_page, check_recording
 
 
 def test_a_page_is_never_what_is_read(tmp_path: Path) -> None:

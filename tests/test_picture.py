@@ -14,8 +14,9 @@ import pytest
 from missions import FRAME, info, picture, tracks, truth
 from numpy.typing import NDArray
 
+from fusion_service.colours import FUSED, SOURCES, TRUTH, source_colours
 from fusion_service.geodesy import enu_to_geodetic, geodetic_to_ecef
-from fusion_service.picture import FUSED, SOURCES, TRUTH, mission_map, source_colours
+from fusion_service.review.mission_map import mission_map
 from schemas import Disk, Ecef, Enu, Local, Message, Polygon, Sector
 
 image = pytest.importorskip("matplotlib.image")
@@ -61,7 +62,7 @@ def test_colours_are_fixed_by_name_and_reserved() -> None:
 
 
 def test_nothing_heavy_is_imported_before_a_map_is_drawn() -> None:
-    code = "import sys, fusion_service.picture; sys.exit(bool({'matplotlib', 'rerun'} & set(sys.modules)))"
+    code = "import sys, fusion_service.review.mission_map; sys.exit(bool({'matplotlib', 'rerun'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 

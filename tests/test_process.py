@@ -12,7 +12,7 @@ SLOW_IMPORT = """
 import sys
 class Slow:
     def find_spec(self, name, path=None, target=None):
-        if name == "fusion_service.bus":
+        if name == "fusion_service.bus.session":
             print("importing", flush=True)
             sys.stdin.readline()
 sys.meta_path.insert(0, Slow())

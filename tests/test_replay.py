@@ -21,10 +21,10 @@ from scene import COMMAND, Program, opened
 import schemas
 from fusion_service.cli import main
 from fusion_service.config import centre_config, config_hash
+from fusion_service.config.settings import nested, plain_settings, recordable
 from fusion_service.errors import ReviewError
-from fusion_service.replay import Replay, run_replay
+from fusion_service.review.replay import Replay, run_replay
 from fusion_service.rules import RULES
-from fusion_service.settings import nested, plain_settings, recordable
 from schemas import GlobalTracks, LocalTracks, StepLog
 
 OPTIONS: dict[str, dict[str, Any]] = {

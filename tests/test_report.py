@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from recording.mission import mission
 
-from fusion_service.evaluation import Assessment, assess
-from fusion_service.evaluation.logbook import Logbook
-from fusion_service.evaluation.report import report
-from fusion_service.evaluation.report_text import WORDS
-from fusion_service.evaluation.tables import digits
+from fusion_service.review.evaluation import Assessment, assess
+from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.evaluation.report import report
+from fusion_service.review.evaluation.report_text import WORDS
+from fusion_service.review.evaluation.tables import digits
 from schemas import GlobalTracks, Message, Truth
 
 STEPS = 40

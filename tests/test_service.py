@@ -185,8 +185,8 @@ def test_a_step_that_fails_does_not_end_the_service(
 ) -> None:
     from fusion_service.centre import FusionCentre
     from fusion_service.config import load_config
-    from fusion_service.daemon import Service
-    from fusion_service.state import open_state
+    from fusion_service.service.daemon import Service
+    from fusion_service.service.state import open_state
 
     broken = {"checkpoint": False, "steps": 0}
     make, real = FusionCentre.__init__, FusionCentre.step

@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 from processes import Program
 
-from fusion_service import state as state_module
-from fusion_service.state import StateError, open_state
+from fusion_service.service import state as state_module
+from fusion_service.service.state import StateError, open_state
 
 TAKER = """
 import sys
-from fusion_service.state import open_state
+from fusion_service.service.state import open_state
 with open_state(sys.argv[1]) as state:
     n = 0
     while True:

@@ -14,7 +14,7 @@ from fusion_service.errors import ReviewError
 from fusion_service.progress import Progress
 
 if TYPE_CHECKING:
-    from fusion_service.evaluation import Assessment
+    from fusion_service.review.evaluation import Assessment
     from schemas import Truth
 
 HELP = "How good the tracks of a mission were: against truth where there is any, and against each other."
@@ -45,15 +45,15 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    from fusion_service.evaluation.results import results, text
-    from fusion_service.evaluation.truth import read_truth
-    from fusion_service.outputs import check_page
+    from fusion_service.review.evaluation.results import results, text
+    from fusion_service.review.evaluation.truth import read_truth
+    from fusion_service.review.outputs import check_page
 
     for page in filter(None, (args.json, args.html)):
         check_page(page, *args.recordings, *filter(None, [args.truth]))
     _need_rerun()
     if args.html:
-        from fusion_service.evaluation.report import need_matplotlib
+        from fusion_service.review.evaluation.report import need_matplotlib
 
         need_matplotlib()
     done: list[Assessment] = []
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         Path(args.json).write_text(json.dumps(results(done), allow_nan=False) + "\n", encoding="utf-8")
         print(f"scores: {args.json}")
     if args.html:
-        from fusion_service.evaluation.report import report
+        from fusion_service.review.evaluation.report import report
 
         Path(args.html).write_text(report(done), encoding="utf-8")
         print(f"page:   {args.html}")
@@ -95,8 +95,8 @@ def _need_rerun() -> None:
 def _assess(
     path: Path, truths: list[Truth], cutoff: float | None, args: argparse.Namespace, stop: threading.Event
 ) -> Assessment:
-    from fusion_service.evaluation import assess
-    from fusion_service.evaluation.logbook import Logbook
+    from fusion_service.review.evaluation import assess
+    from fusion_service.review.evaluation.logbook import Logbook
 
     with Progress(path.name) as bar:
         size = max(path.stat().st_size, 1) if path.is_file() else 1

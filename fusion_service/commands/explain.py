@@ -37,8 +37,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Run the command."""
     from fusion_service.errors import ReviewError
-    from fusion_service.explain import explanation, listing, read_mission, write_view
-    from fusion_service.outputs import check_recording
+    from fusion_service.review.explain import explanation, listing, read_mission, write_view
+    from fusion_service.review.outputs import check_recording
 
     if args.track is None and (args.at is not None or args.out is not None):
         raise ReviewError("--at and --out are about one track: name it with --track")

@@ -23,7 +23,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    from fusion_service.export import export
+    from fusion_service.review.export import export
 
     done = export(Path(args.recording), Path(args.out), args.what, args.centre, stop.is_set)
     print(f"{args.out}: {done.rows} rows, {done.times} times" + (", stopped early" if stop.is_set() else ""))

@@ -50,8 +50,8 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Run the command."""
     from fusion_service.errors import ReviewError
-    from fusion_service.outputs import check_page, check_recording
-    from fusion_service.replay import run_replay
+    from fusion_service.review.outputs import check_page, check_recording
+    from fusion_service.review.replay import run_replay
 
     if args.out is None and not args.verify:
         raise ReviewError("nothing to do: name a recording to write with --out, or compare with --verify")

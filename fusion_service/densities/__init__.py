@@ -5,7 +5,7 @@ batch = Mixtures.of([mixture, ...])                    # many, batch-last, trust
 reduce_mixture(mixture, max_components=4, prune=1e-4)
 """
 
-from .divergence import (
+from fusion_service.densities.divergence import (
     chernoff_discrete,
     chernoff_gaussians,
     chernoff_mixtures,
@@ -13,9 +13,17 @@ from .divergence import (
     kl_gaussians,
     overlap_gaussians,
 )
-from .mixture import DensityError, Mixture, Mixtures, log_gaussian, log_sum, moments, power_product
-from .reduction import reduce_mixture, reduce_mixtures
-from .sampling import draws, halved_sum, sampled_moments
+from fusion_service.densities.mixture import (
+    DensityError,
+    Mixture,
+    Mixtures,
+    log_gaussian,
+    log_sum,
+    moments,
+    power_product,
+)
+from fusion_service.densities.reduction import reduce_mixture, reduce_mixtures
+from fusion_service.densities.sampling import draws, halved_sum, sampled_moments
 
 __all__ = [
     "DensityError",

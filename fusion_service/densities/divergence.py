@@ -18,10 +18,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray, total
-from .mixture import LOG_2PI, Mixture, Mixtures, log_gaussian, log_sum
-from .sampling import draws, halved_sum
+from fusion_service import linalg
+from fusion_service.densities.mixture import LOG_2PI, Mixture, Mixtures, log_gaussian, log_sum
+from fusion_service.densities.sampling import draws, halved_sum
+from fusion_service.linalg import FloatArray, total
 
 __all__ = [
     "chernoff_discrete",

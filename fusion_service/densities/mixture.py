@@ -17,8 +17,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import linalg
-from ..linalg import FloatArray, total
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, total
 
 __all__ = [
     "DensityError",

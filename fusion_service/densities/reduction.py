@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray, total
-from .mixture import DensityError, Mixture, Mixtures, log_sum
+from fusion_service import linalg
+from fusion_service.densities.mixture import DensityError, Mixture, Mixtures, log_sum
+from fusion_service.linalg import FloatArray, total
 
 __all__ = ["reduce_mixture", "reduce_mixtures"]
 

@@ -9,8 +9,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
 
 __all__ = ["draws", "halved_sum", "sampled_moments"]
 

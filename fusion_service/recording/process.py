@@ -11,7 +11,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_service.inbox import Inbox
+from fusion_service.bus.inbox import Inbox
 from fusion_service.recording.parts import Rotation
 from fusion_service.recording.recorder import Recorder
 from schemas import REALM, Frame

@@ -27,12 +27,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from fusion_service.errors import ReviewError
-from fusion_service.recording.blueprint import blueprint, track_blueprint
 from fusion_service.recording.columns import Columns, Stamp, entity, import_rerun, raw
+from fusion_service.recording.drawing.blueprint import blueprint, track_blueprint
+from fusion_service.recording.drawing.scene import MAX_SOURCES, PATIENCE, Scene
 from fusion_service.recording.parts import Folder, Rotation, begin, is_folder, number_of, parts
 from fusion_service.recording.reader import recording_id
 from fusion_service.recording.repair import mend
-from fusion_service.recording.scene import MAX_SOURCES, PATIENCE, Scene
 from schemas import REALM, Frame, Message, MessageError, SensorInfo, check_realm, decode, parse_key
 
 if TYPE_CHECKING:

@@ -10,10 +10,10 @@ from threading import Event
 from typing import Any
 
 from fusion_service.config import CentreConfig, config_hash
+from fusion_service.config.settings import known_settings, nested
 from fusion_service.errors import ReviewError
 from fusion_service.recording import read
 from fusion_service.recording.columns import import_rerun
-from fusion_service.settings import known_settings, nested
 from schemas import REALM, Key, MessageError, StepLog, decode, parse_key
 
 __all__ = ["RecordedCentre", "Survey", "key_of", "survey"]

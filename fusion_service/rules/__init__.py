@@ -7,9 +7,9 @@ each rule is and what it promises.
     fused.mean, fused.covariance, fused.weights
 """
 
-from .face import Fused, fuse, fuse_last
-from .mixtures import fuse_mixtures
-from .options import RuleError
-from .registry import RULES, Rule
+from fusion_service.rules.face import Fused, fuse, fuse_last
+from fusion_service.rules.mixtures import fuse_mixtures
+from fusion_service.rules.options import RuleError
+from fusion_service.rules.registry import RULES, Rule
 
 __all__ = ["RULES", "Fused", "Rule", "RuleError", "fuse", "fuse_last", "fuse_mixtures"]

@@ -22,13 +22,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray, inner, total
-from . import search, simplex
-from .harmonic import Mixture
-from .inverse import root
-from .pencil import pencil
-from .sources import Result, Sources
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, inner, total
+from fusion_service.rules.harmonic import Mixture
+from fusion_service.rules.inverse import root
+from fusion_service.rules.sources import Result, Sources
+from fusion_service.rules.weights import search, simplex
+from fusion_service.rules.weights.pencil import pencil
 
 
 def aa(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray
-from .sources import Result, Sources, condition
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
+from fusion_service.rules.sources import Result, Sources, condition
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,11 +15,11 @@ by up to that factor. The mean is that of CI.
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray, total
-from .harmonic import all_but_one
-from .intersection import ci
-from .sources import Result, Sources, weighted_sum
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, total
+from fusion_service.rules.harmonic import all_but_one
+from fusion_service.rules.intersection import ci
+from fusion_service.rules.sources import Result, Sources, weighted_sum
 
 
 def fast_ci(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:

@@ -11,11 +11,11 @@ These weights favour the worst source (it must be as near as the best one), as D
 weights did better there.
 """
 
-from .. import linalg
-from ..linalg import FloatArray, inner, total
-from . import search
-from .harmonic import hmd_ga as fixed
-from .sources import Result, Sources
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, inner, total
+from fusion_service.rules.harmonic import hmd_ga as fixed
+from fusion_service.rules.sources import Result, Sources
+from fusion_service.rules.weights import search
 
 
 def hmd_ga(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str, constants: bool) -> Result:

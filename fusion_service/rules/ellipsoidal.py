@@ -24,11 +24,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray
-from .chain import Pair, pairwise
-from .pencil import pencil
-from .sources import Result, Sources
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
+from fusion_service.rules.chain import Pair, pairwise
+from fusion_service.rules.sources import Result, Sources
+from fusion_service.rules.weights.pencil import pencil
 
 ETA = 1e-6
 

@@ -16,12 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .. import linalg
-from ..linalg import FloatArray
-from .options import RuleError, array, at, checked
-from .registry import FUNCTIONS, RULES
-from .simplex import GAP
-from .sources import Result, Sources
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
+from fusion_service.rules.options import RuleError, array, at, checked
+from fusion_service.rules.registry import FUNCTIONS, RULES
+from fusion_service.rules.sources import Result, Sources
+from fusion_service.rules.weights.simplex import GAP
 
 FAST_CONDITION = 1e7
 SAFE_CONDITION = 4e12 if np.finfo(np.longdouble).eps < 2e-19 else 0.0

@@ -28,10 +28,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray, inner, total
-from . import line, pairs, simplex
-from .sources import Result, Sources, condition, weighted_mean, weighted_sum
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, inner, total
+from fusion_service.rules.sources import Result, Sources, condition, weighted_mean, weighted_sum
+from fusion_service.rules.weights import line, pairs, simplex
 
 
 def hmd_ga(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str, constants: bool) -> Result:

@@ -22,10 +22,10 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray, inner
-from . import line, pairs, simplex
-from .sources import Result, Sources, weighted_product, weighted_sum
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, inner
+from fusion_service.rules.sources import Result, Sources, weighted_product, weighted_sum
+from fusion_service.rules.weights import line, pairs, simplex
 
 
 def ci(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:

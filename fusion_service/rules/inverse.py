@@ -29,12 +29,12 @@ from functools import partial
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray, inner, product, total, trace
-from . import simplex
-from .chain import Pair, pairwise
-from .pencil import pencil
-from .sources import Result, Sources, condition, weighted_sum
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, inner, product, total, trace
+from fusion_service.rules.chain import Pair, pairwise
+from fusion_service.rules.sources import Result, Sources, condition, weighted_sum
+from fusion_service.rules.weights import simplex
+from fusion_service.rules.weights.pencil import pencil
 
 LIMIT = 6
 """Up to this dimension the weights for det come from symmetric functions; rounding spoils them above."""

@@ -9,9 +9,9 @@ which is x = x_1 + (P_1 - P_12)(P_1 + P_2 - P_12 - P_12')^-1 (x_2 - x_1): the be
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray
-from .sources import Result, Sources, condition
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
+from fusion_service.rules.sources import Result, Sources, condition
 
 
 def bar_shalom_campo(

@@ -39,8 +39,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import gammaincinv
 
-from .. import linalg
-from ..densities import (
+from fusion_service import linalg
+from fusion_service.densities import (
     DensityError,
     Mixture,
     Mixtures,
@@ -53,10 +53,10 @@ from ..densities import (
     reduce_mixtures,
     sampled_moments,
 )
-from ..linalg import FloatArray, total
-from .face import fuse_last
-from .options import RuleError, array, checked
-from .registry import RULES, Rule
+from fusion_service.linalg import FloatArray, total
+from fusion_service.rules.face import fuse_last
+from fusion_service.rules.options import RuleError, array, checked
+from fusion_service.rules.registry import RULES, Rule
 
 __all__ = ["MIXTURE_RULES", "fuse_mixtures", "fuse_mixtures_last"]
 

@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
 
 CRITERIA: Mapping[str, tuple[str, ...]] = {
     "hmd-ga": ("det", "trace", "kl"),

@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray
-from .sources import Result, Sources, weighted_product
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
+from fusion_service.rules.sources import Result, Sources, weighted_product
 
 
 def naive(sources: Sources, weights: FloatArray | None, influence: bool) -> Result:

@@ -5,18 +5,18 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from .average import aa
-from .closed_form import fast_ci, ffcc
-from .dispersion import hmd_ga
-from .ellipsoidal import ei
-from .intersection import bci, ci
-from .inverse import ici
-from .known import bar_shalom_campo
-from .product import naive
-from .sampled import gmd_s, hmd_s
-from .sources import Result
-from .union import cu
-from .units import in_units
+from fusion_service.rules.average import aa
+from fusion_service.rules.closed_form import fast_ci, ffcc
+from fusion_service.rules.dispersion import hmd_ga
+from fusion_service.rules.ellipsoidal import ei
+from fusion_service.rules.intersection import bci, ci
+from fusion_service.rules.inverse import ici
+from fusion_service.rules.known import bar_shalom_campo
+from fusion_service.rules.product import naive
+from fusion_service.rules.sampled import gmd_s, hmd_s
+from fusion_service.rules.sources import Result
+from fusion_service.rules.union import cu
+from fusion_service.rules.units import in_units
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,13 +24,13 @@ from functools import partial
 
 import numpy as np
 
-from .. import linalg
-from ..linalg import FloatArray, total
-from .chain import alone
-from .harmonic import hmd_ga
-from .intersection import ci
-from .pencil import lower_inverse
-from .sources import Result, Sources
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, total
+from fusion_service.rules.chain import alone
+from fusion_service.rules.harmonic import hmd_ga
+from fusion_service.rules.intersection import ci
+from fusion_service.rules.sources import Result, Sources
+from fusion_service.rules.weights.pencil import lower_inverse
 
 FEW = 100
 

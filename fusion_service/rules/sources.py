@@ -6,8 +6,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,11 +18,11 @@ over the estimates is not enough, least of all for min.
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import linalg
-from ..linalg import FloatArray, inner, total, trace
-from .chain import alone
-from .pencil import eigen, lower_inverse, pencil
-from .sources import Result, Sources, condition
+from fusion_service import linalg
+from fusion_service.linalg import FloatArray, inner, total, trace
+from fusion_service.rules.chain import alone
+from fusion_service.rules.sources import Result, Sources, condition
+from fusion_service.rules.weights.pencil import eigen, lower_inverse, pencil
 
 GAP = 2e-10
 FACTOR = 8.0

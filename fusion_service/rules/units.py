@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..linalg import FloatArray
-from .sources import Result, Sources
+from fusion_service.linalg import FloatArray
+from fusion_service.rules.sources import Result, Sources
 
 
 def in_units(rule: Callable[..., Result]) -> Callable[..., Result]:

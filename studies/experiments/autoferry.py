@@ -30,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service.demo import AUTOFERRY
-from fusion_service.evaluation import METRICS, Scores, evaluate
+from fusion_service.review.evaluation import METRICS, Scores, evaluate
 from schemas import Truth
 from sensor_clients.playback.autoferry import load
 from studies import missions

@@ -37,8 +37,8 @@ from numpy.typing import NDArray
 
 from fusion_service.bus import open_bus
 from fusion_service.config import BusConfig, DaemonConfig, ServiceConfig, centre_config
-from fusion_service.daemon import run_service
 from fusion_service.rules import Fused
+from fusion_service.service.daemon import run_service
 from schemas import GlobalTracks, Local, Motion, Status, decode, global_key
 from sensor_clients.publisher import TrackPublisher
 from studies import sonobuoys

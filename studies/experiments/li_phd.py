@@ -13,7 +13,7 @@ The rules, weights 1/N each:
 
 * AA: the mean of the intensities. GA exact: prod f_i^(1/N). GA (49): every power of a sum as the sum of the powers.
 * hybrid: GA (49) scaled to the mass of AA, as Li-2nd 5.1 and 5.2 have it.
-* cells AA, GA, hybrid: the product's rules (`fusion_service.cells`), which match components first and average within
+* cells AA, GA, hybrid: the product's rules (`centre.cells`), which match components first and average within
   a match: a target that one sensor does not report has no GA at all there, and keeps its share of the mass in hybrid.
 
 The first four are evaluated on a grid of step 0.25; a peak is a maximum of the fused intensity with the mass between
@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from fusion_service.cells import Components, find_cells, fuse_cells
+from fusion_service.centre.cells import Components, find_cells, fuse_cells
 from fusion_service.metrics import gospa
 from studies.experiments.li_densities import FIG7
 from studies.pictures import colour

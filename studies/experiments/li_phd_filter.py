@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 import schemas
-from fusion_service.cells import Components, find_cells, fuse_cells, reduced
+from fusion_service.centre.cells import Components, find_cells, fuse_cells, reduced
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import gospa
 from sensor_clients.filters import GmPhdFilter, PhdConfig, Position

@@ -12,8 +12,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fusion_service import association, linalg
-from fusion_service.association import by_size, candidate_pairs, cluster, leave_one_out, pair_distance, uniform_ci
+from fusion_service import linalg
+from fusion_service.centre import association
+from fusion_service.centre.association import (
+    by_size,
+    candidate_pairs,
+    cluster,
+    leave_one_out,
+    pair_distance,
+    uniform_ci,
+)
 
 
 def gaussians(count: int, n: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.stats import chi2, multivariate_normal
 
-from fusion_service.cells import Components, Covering, find_cells, fuse_cells, merge_near, reduced
+from fusion_service.centre.cells import Components, Covering, find_cells, fuse_cells, merge_near, reduced
 
 Array = NDArray[np.float64]
 Source = list[tuple[float, Array, Array]]

@@ -15,7 +15,7 @@ from worlds import SIGMA, SPACE, centre, give, info, moved, seen, step, tracks, 
 
 import schemas
 from fusion_service.centre import FusionCentre, Order, SourceFound, SourceLost, StepResult
-from fusion_service.checkpoint import CheckpointError
+from fusion_service.centre.checkpoint import CheckpointError
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 SOURCES = ("r1", "r2", "r3")

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from worlds import SECOND, START
 
-from fusion_service.clock import MessageClock, WallClock
+from fusion_service.centre import MessageClock, WallClock
 from fusion_service.config import CentreConfig
 
 

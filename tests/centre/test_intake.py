@@ -212,7 +212,7 @@ def test_partial_scans_of_many_tracks_are_taken_together_and_as_one_by_one() -> 
 
 
 def test_a_table_full_of_tracks_takes_its_own_updates_and_refuses_more() -> None:
-    from fusion_service.intake import MAX_TRACKS
+    from fusion_service.centre.intake import MAX_TRACKS
 
     rng = np.random.default_rng(1)
     count = MAX_TRACKS

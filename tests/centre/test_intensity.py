@@ -13,9 +13,8 @@ import pytest
 from worlds import FRAME, SECOND, SPACE, START, give, info, moved, step, tracks, truth
 
 import schemas
-from fusion_service.centre import FusionCentre, Order, StepResult
-from fusion_service.checkpoint import CheckpointError
-from fusion_service.intensity import IntensityCentre
+from fusion_service.centre import FusionCentre, IntensityCentre, Order, StepResult
+from fusion_service.centre.checkpoint import CheckpointError
 from fusion_service.metrics import gospa
 from schemas import Disk
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE

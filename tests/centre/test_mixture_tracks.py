@@ -143,7 +143,7 @@ def test_modes_meet_where_means_would_not() -> None:
 
 
 def test_overlap_is_the_integral_of_the_product() -> None:
-    from fusion_service.association import overlap
+    from fusion_service.centre.association import overlap
     from fusion_service.densities import Mixtures
 
     [one], [other] = some(1, 3, 11), some(1, 2, 12)

@@ -15,8 +15,8 @@ from recording.mission import RADARS, SIGMA, START, TARGETS, Sent, mission, posi
 from scipy.stats import binomtest, chi2
 
 from fusion_service.recording import Recorder
-from fusion_service.recording.assessment import Assessment, Score
 from fusion_service.recording.columns import Stamp
+from fusion_service.recording.drawing.errors import Assessment, Score
 from schemas import Message, encode, global_key, local_key
 
 SECOND = 10**9

@@ -169,9 +169,9 @@ def test_existence_over_time_of_each_confirmed_track(tmp_path: Path) -> None:
 def test_a_flood_of_components_and_tracks_is_drawn_by_the_heaviest(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fusion_service.recording.tables.MAX_COMPONENTS", 2)
-    monkeypatch.setattr("fusion_service.recording.charts.MAX_RUNNING", 3)
-    monkeypatch.setattr("fusion_service.recording.charts.MAX_SERIES", 4)
+    monkeypatch.setattr("fusion_service.recording.drawing.tables.MAX_COMPONENTS", 2)
+    monkeypatch.setattr("fusion_service.recording.drawing.charts.MAX_RUNNING", 3)
+    monkeypatch.setattr("fusion_service.recording.drawing.charts.MAX_SERIES", 4)
     path = tmp_path / "a.rrd"
     pictures = [missions.picture(s, ids, np.zeros((len(ids), 2))) for s, ids in enumerate([range(5), range(2, 9)])]
     said: list[Message] = [*pictures, mixture(0), phd(0, [0.2, 0.9, 0.1, 0.5])]

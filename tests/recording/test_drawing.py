@@ -16,7 +16,7 @@ from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from fusion_service.recording import read
-from fusion_service.recording.geometry import moments
+from fusion_service.recording.drawing.geometry import moments
 from schemas import Ecef, Enu, Local, Message, Polygon, encode, global_key, local_key
 
 SECOND = 10**9

@@ -12,8 +12,9 @@ from recording.contents import entities, key_of, row, rows, static, texts
 from recording.mission import GENERATION, RADARS, START, Sent, mission, positions
 from rerun.chunk import RrdReader
 
-from fusion_service.recording import Recorder, palette
-from fusion_service.recording.geometry import Chart, rings
+from fusion_service.recording import Recorder
+from fusion_service.recording.drawing import palette
+from fusion_service.recording.drawing.geometry import Chart, rings
 from schemas import Enu, GlobalTracks, Message, StepLog, encode, global_key, local_key
 from schemas.messages import BROKEN, KEPT, LINKED, MERGED, NO_SOURCE
 
@@ -205,8 +206,8 @@ def test_circles_of_distance_are_few_and_within_the_view(reach: float) -> None:
 
 
 def test_memory_of_names_and_generations_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fusion_service.recording.labels.MAX_GENERATIONS", 3)
-    monkeypatch.setattr("fusion_service.recording.scene.MAX_CENTRES", 2)
+    monkeypatch.setattr("fusion_service.recording.drawing.labels.MAX_GENERATIONS", 3)
+    monkeypatch.setattr("fusion_service.recording.drawing.scene.MAX_CENTRES", 2)
     base: Any = next(s.message for s in mission(1) if isinstance(s.message, GlobalTracks))
     said: list[Message] = [replace(base, source=f"centre{n}", seq=n) for n in range(4)]
     said += [replace(base, source="centre0", seq=9 + n, ids=base.ids + np.uint64(n << 32)) for n in range(6)]

@@ -140,7 +140,7 @@ def test_a_recorder_that_finds_no_bus_takes_its_viewers_server_along(
     def none(*_: object, **__: object) -> None:
         raise OSError("no bus")
 
-    monkeypatch.setattr("fusion_service.bus.open_bus", none)
+    monkeypatch.setattr("fusion_service.bus.session.open_bus", none)
     port = free_port()
     assert main(["record", "--out", str(tmp_path / "a.rrd"), "--live", f"{HOST}:{port}"]) == 1
     eventually(lambda: is_free(port))

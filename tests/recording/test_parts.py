@@ -15,9 +15,9 @@ from recording.contents import entities, rows, static
 from recording.mission import RADARS, Sent, mission
 from rerun.chunk import RrdReader
 
-from fusion_service import units
 from fusion_service.bus import open_bus
 from fusion_service.cli import main
+from fusion_service.commands import units
 from fusion_service.errors import ReviewError
 from fusion_service.recording import Recorder, Rotation, messages, parts, read
 from fusion_service.recording.parts import DEFAULT_SIZE, Folder, is_folder

@@ -271,9 +271,9 @@ def test_closing_twice_changes_nothing(tmp_path: Path) -> None:
 def test_a_flood_of_sources_and_tracks_is_recorded_and_only_partly_drawn(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fusion_service.recording.scene.MAX_SOURCES", 3)
-    monkeypatch.setattr("fusion_service.recording.scene.MAX_TRACKS", 10)
-    monkeypatch.setattr("fusion_service.recording.scene.MAX_ASSESSED", 2)
+    monkeypatch.setattr("fusion_service.recording.drawing.scene.MAX_SOURCES", 3)
+    monkeypatch.setattr("fusion_service.recording.drawing.scene.MAX_TRACKS", 10)
+    monkeypatch.setattr("fusion_service.recording.drawing.scene.MAX_ASSESSED", 2)
     places = np.zeros((11, 2))
     said: list[Message] = [missions.tracks(f"radar{n}", 0, [1], [(n, n)]) for n in range(5)]
     said += [missions.tracks("radar0", 1, range(11), places), missions.picture(1, range(3), places[:3])]

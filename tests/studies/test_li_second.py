@@ -10,7 +10,7 @@ from scipy.integrate import dblquad, quad
 from scipy.stats import norm, poisson
 
 import schemas
-from fusion_service.intensity import IntensityCentre
+from fusion_service.centre import IntensityCentre
 from fusion_service.rules import fuse_mixtures
 from studies.experiments import li_densities as densities
 from studies.experiments import li_phd as phd

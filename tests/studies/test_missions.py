@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import schemas
-from fusion_service.evaluation import Evaluation, evaluate
 from fusion_service.geodesy import transform
+from fusion_service.review.evaluation import Evaluation, evaluate
 from schemas import GlobalTracks, LocalTracks, SensorInfo, Truth
 from sensor_clients.scenarios.three_radars import RADARS, three_radars
 from studies import missions

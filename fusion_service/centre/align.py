@@ -1,0 +1,88 @@
+"""Brings every source's newest tracks, and the global ones, to the time and state space of a step."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.rows import Rows
+from fusion_service.centre.sources import Columns, Tracks, join_tracks, no_parts
+from fusion_service.densities import Mixtures
+from fusion_service.motion import predict
+from schemas import Entry, Motion
+
+__all__ = ["predict_tracks", "usable_rows", "write_back"]
+
+PARTS = ("log_weight", "part_mean", "part_covariance")
+LINK_COLUMNS = ("link", "since", "fails", "used")
+
+
+def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
+    """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table, and
+    so does what has no sound density there (refused: ill-conditioned)."""
+    config = intake.config
+    parts: list[Tracks] = []
+    index: list[NDArray[np.intp]] = []
+    epochs: list[NDArray[np.uint64]] = []
+    starts: list[NDArray[np.bool_]] = []
+    kept: dict[str, int] = {}
+    for number, (name, source) in enumerate(sorted(intake.sources.items())):
+        said = intake.declared(source)
+        oldest = time - round(config.stale_periods * said.period * 1e9)
+        source.tracks = table = source.tracks.take(source.tracks.time >= oldest)
+        if source.muted or not intake.ready(source):
+            continue
+        predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9)
+        sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
+        count = int(sound.sum())
+        if count < len(sound):
+            journal.refuse(Entry(name, source.epoch, 0, 0, "ill-conditioned", len(sound) - count))
+            source.tracks = table.take(sound)
+        kept[name] = count
+        parts.append(predicted.take(sound))
+        index.append(np.full(count, number, dtype=np.intp))
+        epochs.append(np.full(count, source.epoch, dtype=np.uint64))
+        starts.append(np.full(count, said.may_start, dtype=np.bool_))
+    if not parts:
+        nothing = intake.nothing()
+        return Rows(np.zeros(0, dtype=np.intp), nothing.id, nothing, np.zeros(0, dtype=np.bool_), kept)
+    return Rows(np.concatenate(index), np.concatenate(epochs), join_tracks(parts), np.concatenate(starts), kept)
+
+
+def predict_tracks(
+    tracks: Columns, motion: Motion, space: tuple[str, ...], wanted: tuple[str, ...], dt: NDArray[np.float64]
+) -> Columns:
+    """Densities `dt` (T,) seconds later, marginalised from `space` to the components `wanted`."""
+    at = [space.index(component) for component in wanted]
+    some = np.ix_(at, at)
+    components = len(tracks.log_weight)
+    if not components:
+        mean, covariance = predict(motion, space, tracks.mean, tracks.covariance, dt)
+        parts = no_parts(len(at), len(dt))
+        return replace(tracks, mean=mean[at], covariance=covariance[some], **dict(zip(PARTS, parts, strict=True)))
+    n, count = tracks.mean.shape
+    means, covariances = predict(
+        motion,
+        space,
+        tracks.part_mean.reshape(n, -1),
+        tracks.part_covariance.reshape(n, n, -1),
+        np.tile(dt, components),
+    )
+    means = means.reshape(n, components, count)[at]
+    covariances = covariances.reshape(n, n, components, count)[some]
+    mean, covariance = Mixtures(tracks.log_weight, means, covariances).moments()
+    return replace(tracks, mean=mean, covariance=covariance, part_mean=means, part_covariance=covariances)
+
+
+def write_back(rows: Rows, intake: Intake) -> None:
+    """Put the columns of links back into the sources' own tables."""
+    start = 0
+    for name, count in rows.kept.items():
+        source, part = intake.sources[name], slice(start, start + count)
+        source.tracks = replace(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINK_COLUMNS})
+        start += count

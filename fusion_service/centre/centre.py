@@ -1,0 +1,177 @@
+"""`Centre`: what every kind of centre shares: events in, the frame of a step, what it publishes, its checkpoint.
+
+A kind says how the usable local tracks become the picture of a step (`_advance`); everything before and after is here.
+Everything that changes a result enters by `handle`; `step(time)` takes what is queued with a time up to then and
+returns the global tracks, a log that is enough to make the step again, and status. Within a step inputs are sorted by
+(source, epoch, seq) before anything is computed, so the order of arrival does not matter, and no operation's bits
+depend on the size of its batch: the same events give the same bytes.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fusion_service import __version__
+from fusion_service.centre.align import usable_rows
+from fusion_service.centre.checkpoint import pack_state, unpack_state
+from fusion_service.centre.ids import Ids
+from fusion_service.centre.intake import Event, Intake, Order
+from fusion_service.centre.journal import Journal, start_event
+from fusion_service.centre.lifecycle import empty_picture
+from fusion_service.centre.publishing import Contributions, picture_message
+from fusion_service.centre.rows import Rows
+from fusion_service.centre.status import step_status
+from fusion_service.config import CentreConfig, centre_config, config_hash
+from schemas import GlobalTracks, Status, StepLog
+from schemas import messages as words
+
+__all__ = ["Centre", "StepResult"]
+
+
+@dataclass(frozen=True, slots=True)
+class StepResult:
+    """What one step gives."""
+
+    tracks: GlobalTracks
+    log: StepLog
+    status: Status
+
+
+class Centre(ABC):
+    """Fuses what many sources say into one picture; no clock, no thread, no socket.
+
+    config: a `CentreConfig`, or a dict of the same shape ({} gives the defaults; `ConfigError` says all that
+    is wrong). checkpoint: what `checkpoint()` gave before; `CheckpointError` if it cannot be used. generation: the
+    upper half of the ids given from now on; a new one for every start keeps ids from ever being used again (a
+    checkpoint alone goes on in its own generation). epoch: start of this run, ns, for the header of what it publishes.
+    """
+
+    def __init__(
+        self,
+        config: CentreConfig | Mapping[str, Any],
+        checkpoint: bytes | None = None,
+        *,
+        generation: int | None = None,
+        epoch: int = 0,
+    ) -> None:
+        self.config = self._own_kind(centre_config(config))
+        self.config_hash = config_hash(self.config)
+        self.epoch = epoch
+        self._intake = Intake(self.config)
+        self._picture = empty_picture(len(self.config.space))
+        self._ids = Ids()
+        self._step = 0
+        self._published = 0
+        self._time = -1
+        self._journal = Journal(self.config.name, self.config_hash, __version__)
+        self._begin()
+        if checkpoint is not None:
+            state, self._picture = unpack_state(checkpoint, self._intake, self.config.space)
+            self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
+            self._restore(state)
+        if generation is not None:
+            self._ids.begin(generation)
+        self._journal.event(start_event(self.config, epoch, generation, checkpoint))
+
+    @property
+    def time(self) -> int:
+        """Time of the newest step, ns; -1 before the first."""
+        return self._time
+
+    def handle(self, event: Event, received: int) -> None:
+        """Queue a message or another event for the next step; `received` is when it came, ns. Never raises
+        for what a message contains: it is checked, and refused with a reason, in the step."""
+        self._intake.put(event, received)
+
+    def step(self, time: int) -> StepResult:
+        """Make the step at `time`, ns, which must be after the last. `ValueError` if it is not."""
+        if time <= self._time:
+            raise ValueError(f"a step at {time} is not after the last, at {self._time}")
+        self._step += 1
+        journal = self._journal
+        self._obey(self._intake.admit(time, self._time, journal))
+        self._time = time
+        rows = usable_rows(self._intake, time, journal)
+        names = self._intake.names()
+        journal.name_sources(names)
+        contributions = self._advance(rows, names, time)
+        tracks = picture_message(
+            self._picture,
+            self._intake,
+            journal,
+            contributions,
+            epoch=self.epoch,
+            seq=self._published,
+            step=self._step,
+            time=time,
+            rule=self._rule,
+        )
+        log = journal.write(self.epoch, self._published, self._step, time)
+        self._published += 1
+        status = step_status(self._intake, journal, log, self._numbers(), self.refusals())
+        return StepResult(tracks, log, status)
+
+    def refusals(self) -> dict[str, int]:
+        """Refusals by reason since the start, those included that no step has told yet."""
+        return dict(sorted((self._journal.refused + self._intake.waiting_refusals()).items()))
+
+    def checkpoint(self) -> bytes:
+        """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""
+        state = {
+            "space": list(self.config.space),
+            "step": self._step,
+            "time": self._time,
+            "next_id": self._ids.next,
+            **self._kept(),
+        }
+        return pack_state(self.config_hash, state, self._intake, self._picture)
+
+    @staticmethod
+    @abstractmethod
+    def _own_kind(config: CentreConfig) -> CentreConfig:
+        """The config with the kind of this centre."""
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Make what this kind has of its own."""
+
+    @abstractmethod
+    def _kept(self) -> dict[str, Any]:
+        """What of that a checkpoint holds, and `_restore` takes again."""
+
+    @abstractmethod
+    def _restore(self, state: dict[str, Any]) -> None:
+        """Go on with what `_kept` gave."""
+
+    @property
+    @abstractmethod
+    def _rule(self) -> str:
+        """The rule that the picture names."""
+
+    @abstractmethod
+    def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
+        """Bring the picture to `time`, ns, with these rows; names: all sources, sorted. Who fed each track."""
+
+    @abstractmethod
+    def _forget(self, tracks: Iterable[int]) -> None:
+        """Undo whatever refers to global tracks that are no more."""
+
+    def _obey(self, orders: list[Order]) -> None:
+        doomed = [order.track for order in orders if order.what == "delete" and order.track is not None]
+        doomed = [track for track in doomed if 0 < track < 2**64]
+        if doomed:
+            gone = np.isin(self._picture.id, np.array(doomed, dtype=np.uint64))
+            for track in self._picture.id[gone].tolist():
+                self._journal.end(track, "ordered", None)
+            self._forget(self._picture.id[gone].tolist())
+            self._picture = self._picture.take(~gone)
+
+    def _numbers(self) -> dict[str, int]:
+        kinds = Counter(self._picture.status.tolist())
+        return {name: kinds.get(code, 0) for code, name in enumerate(words.STATUSES)}

@@ -1,0 +1,171 @@
+"""All global tracks of one step fused at once: every source's track of a target, by the configured rule.
+
+Gaussian tracks go by `rule`. Where a track is a mixture, a target that one source sees keeps it; what several see
+is fused by `mixture_rule` ("moments": by `rule` on means and covariances, and the result is Gaussian), reduced to
+`max_components`. Without options of its own, the arithmetic average ("aa") weighs
+every source by the existence it reports. With recursive memory the predicted last result joins as one more source under
+`memory_correlation`, by its moments, and each version of a local track is used once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.centre.association import by_size, uniform_ci
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import no_parts, padded
+from fusion_service.config import CentreConfig
+from fusion_service.densities import Mixtures, reduce_mixtures
+from fusion_service.rules import Fused, fuse_last
+from fusion_service.rules.mixtures import fuse_mixtures_last
+from schemas import Entry
+
+__all__ = ["fuse_all"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+
+
+MOST_PRODUCTS = 4096
+"""Components that a product of sources may have before it is reduced; theirs are reduced first to fit, and beyond
+twelve sources moments are fused."""
+
+
+def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, journal: Journal) -> tuple[Picture, Floats]:
+    """The picture after fusion, and the influence (M,) of each row: trace(K)/n of its gain, 0 where it brought
+    nothing new, NaN where it has no link.
+
+    picture: predicted to `time`, ns. Of a mixture fused as such the influence is that of its moments; with
+    recursive memory it is the product of the shares in the two stages.
+    """
+    tracks = rows.tracks
+    linked = tracks.link != NO_TRACK
+    influence = np.where(linked, 0.0, np.nan)
+    used = linked if config.memory == "restart" else linked & (tracks.time > tracks.used)
+    chosen = np.flatnonzero(used)
+    mean, covariance = picture.mean.copy(), picture.covariance.copy()
+    state_time = np.where(picture.time >= 0, time, -1)
+    mixed: list[tuple[Ints, Mixtures]] = []
+    done: list[Ints] = []
+    for ids, groups in by_size(tracks.link[chosen]):
+        at, members = picture.find(ids), chosen[groups]
+        one, spread, gains = _gaussian(rows, members, config, journal)
+        parts, several = _as_mixtures(rows, members, config)
+        if parts is not None:
+            one[:, several], spread[:, :, several] = parts.moments()
+            mixed.append((at[several], parts))
+        if config.memory == "recursive":
+            old = np.flatnonzero(picture.time[at] >= 0)
+            _remember(one, spread, gains, picture, at, old, config)
+        mean[:, at], covariance[:, :, at], state_time[at] = one, spread, time
+        influence[members] = gains.T
+        done.append(at)
+    tracks.used[chosen] = tracks.time[chosen]
+    picture = replace(picture, mean=mean, covariance=covariance, time=state_time)
+    return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
+
+
+def _gaussian(rows: Rows, members: Ints, config: CentreConfig, journal: Journal) -> tuple[Floats, Floats, Floats]:
+    means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
+    covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
+    weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
+    fused = fuse_last(config.rule, means, covariances, weights, influence=True, **config.rule_options)
+    one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+    bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
+    if bad.any():
+        one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
+        gains[:, bad] = 1.0 / len(means)
+        journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
+    return one, spread, gains
+
+
+def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtures | None, NDArray[np.bool_]]:
+    """The fused mixtures of the groups where a member is one, and which groups these are."""
+    components = np.isfinite(rows.tracks.log_weight).sum(axis=0) if len(rows.tracks.log_weight) else None
+    several = np.zeros(len(members), dtype=np.bool_)
+    alone = members.shape[1] == 1
+    if components is None or config.memory == "recursive" or (config.mixture_rule == "moments" and not alone):
+        return None, several
+    several = (components[members] > 1).any(axis=1)
+    if not several.any():
+        return None, several
+    sources = [rows.tracks.mixtures(members[several, j]) for j in range(members.shape[1])]
+    if alone:
+        return sources[0], several
+    fits = max(1, int(MOST_PRODUCTS ** (1 / len(sources)) + 1e-9))
+    if config.mixture_rule != "aa" and max(len(one.log_weights) for one in sources) > fits:
+        if fits == 1:
+            return None, np.zeros(len(members), dtype=np.bool_)
+        sources = [reduce_mixtures(one, max_components=fits) for one in sources]
+    options = {**config.mixture_options, "max_components": config.max_components}
+    by_existence = config.mixture_rule == "aa" and not config.mixture_options
+    weights = _shares(rows, members[several]) if by_existence else None
+    parts, _ = fuse_mixtures_last(config.mixture_rule, sources, weights, **options)
+    mean, covariance = parts.moments()
+    sound = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
+    several[np.flatnonzero(several)[~sound]] = False
+    return parts.take(sound), several
+
+
+def _shares(rows: Rows, members: Ints) -> Floats:
+    """Weights (k, B) of an arithmetic average: each source counts as it believes in the target."""
+    r = np.nan_to_num(rows.tracks.existence[members].T, nan=1.0)
+    total = r[0]
+    for one in r[1:]:
+        total = total + one
+    return np.where(total > 0, r / np.where(total > 0, total, 1.0), 1.0 / len(r))
+
+
+def _remember(
+    one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, config: CentreConfig
+) -> None:
+    """Fuse the result of the local tracks with the predicted last one, where there is one."""
+    if not len(old):
+        return
+    again = fuse_last(
+        "bci",
+        np.stack([one[:, old], picture.mean[:, at[old]]]),
+        np.stack([spread[:, :, old], picture.covariance[:, :, at[old]]]),
+        influence=True,
+        max_correlation=config.memory_correlation,
+    )
+    good = linalg.is_positive_definite(again.covariance) & np.isfinite(again.mean).all(axis=0)
+    kept = old[good]
+    one[:, kept], spread[:, :, kept] = again.mean[:, good], again.covariance[:, :, good]
+    gains[:, kept] *= _influence(again)[0][good]
+
+
+def _with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]]) -> Picture:
+    """The picture with the components of the tracks just fused; without any where all are Gaussian."""
+    most = max([len(picture.log_weight), *(len(parts.log_weights) for _, parts in mixed)])
+    if not most:
+        return picture
+    picture = padded(picture, most)
+    log_weight, means, covariances = (
+        column.copy() for column in (picture.log_weight, picture.part_mean, picture.part_covariance)
+    )
+    log_weight[:, done] = -np.inf
+    log_weight[0, done] = 0.0
+    means[:, :, done] = picture.mean[:, None, done]
+    covariances[:, :, :, done] = picture.covariance[:, :, None, done]
+    for at, parts in mixed:
+        size = len(parts.log_weights)
+        log_weight[:size, at] = parts.log_weights
+        means[:, :size, at], covariances[:, :, :size, at] = parts.means, parts.covariances
+    needed = int(np.flatnonzero(np.isfinite(log_weight).any(axis=1))[-1]) + 1 if log_weight.shape[1] else 0
+    if needed <= 1:
+        columns = no_parts(len(picture.mean), len(picture.id))
+    else:
+        columns = log_weight[:needed], means[:, :needed], covariances[:, :, :needed]
+    return replace(picture, log_weight=columns[0], part_mean=columns[1], part_covariance=columns[2])
+
+
+def _influence(fused: Fused) -> Floats:
+    assert fused.influence is not None
+    return fused.influence

@@ -1,0 +1,394 @@
+"""From queued events to sources with sound tracks: the border where every input is checked, once.
+
+Reasons of refusal, beside those of `schemas.MessageError` (what cannot be decoded) and `schemas.FAULTS` (bad
+numbers): type, muted, loop, future, old-epoch, repeat, late, space, frame, intensity (or tracks: what this centre
+does not fuse), length, bad-info, too-many-tracks, too-many-sources.
+
+An intensity stands in its source's table as a complete scan: a track per component, its weight as existence.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass, replace
+from itertools import groupby
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.centre.clock import horizon
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.sources import Source, Tracks, empty_tracks, message_tracks
+from fusion_service.config import CentreConfig, SourceConfig
+from fusion_service.geodesy import FrameError
+from schemas import (
+    FAULTS,
+    Entry,
+    Frame,
+    LocalIntensity,
+    LocalTracks,
+    Message,
+    MessageError,
+    SensorInfo,
+    check_name,
+    check_numbers,
+    digest,
+)
+
+__all__ = ["Event", "Intake", "Order", "Refused", "SourceFound", "SourceLost"]
+
+MAX_SOURCES = 1000
+MAX_TRACKS = 20_000
+MAX_TOTAL = 50_000
+MAX_QUEUED = 50_000
+MAX_COMPONENTS = 500_000
+MAX_EVENTS = 10_000
+MAX_PERIOD = 1e5
+MAX_WEIGHT = 1e3
+"""Expected number in one component of an intensity."""
+
+
+@dataclass(frozen=True, slots=True)
+class SourceFound:
+    """The source's liveliness token is there."""
+
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class SourceLost:
+    """The source's liveliness token is gone: its tracks live on until they are stale."""
+
+    source: str
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """An operator's order: `mute` or `unmute` a source, `delete` a global track."""
+
+    what: str
+    source: str = ""
+    track: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Refused:
+    """Something refused, or `dropped` from a full queue, before it came here: to be counted and logged."""
+
+    source: str
+    reason: str
+    count: int = 0
+    dropped: bool = False
+
+
+Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused
+_Queued: TypeAlias = tuple[Message, int]
+_Scan: TypeAlias = LocalTracks | LocalIntensity
+_Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]
+
+
+class Intake:
+    """The queue before the step, and the sources behind it. Everything in it is bounded, whatever is sent."""
+
+    def __init__(self, config: CentreConfig) -> None:
+        self.config = config
+        self.frame: Frame | None = config.frame
+        self.sources: dict[str, Source] = {}
+        self._queue: list[_Queued] = []
+        self._held: Counter[str] = Counter()
+        self._components = 0
+        self._orders: list[Order] = []
+        self._present: dict[str, bool] = {}
+        self._refused: Counter[tuple[str, str, bool]] = Counter()
+        self._dead: list[str] | None = None
+
+    def put(self, event: Event, received: int) -> None:
+        """Queue an event; messages beyond `max_pending` of one source, or `MAX_QUEUED` or `MAX_COMPONENTS` of
+        all together, are dropped and counted."""
+        if isinstance(event, (SourceFound, SourceLost)):
+            if event.source in self._present or len(self._present) < 2 * MAX_SOURCES:
+                self._present[event.source] = isinstance(event, SourceFound)
+        elif isinstance(event, Order):
+            if len(self._orders) < MAX_EVENTS:
+                self._orders.append(event)
+        elif isinstance(event, Refused):
+            self._count(event.source, event.reason, max(event.count, 1), event.dropped)
+        elif self._is_full(event):
+            self._count(event.source, "pending", 1, dropped=True)
+        else:
+            self._queue.append((event, received))
+            self._held[event.source] += 1
+            self._components += _size(event)
+
+    def _is_full(self, message: Message) -> bool:
+        full = len(self._queue) >= MAX_QUEUED or self._components + _size(message) > MAX_COMPONENTS
+        return full or self._held[message.source] >= self.config.max_pending
+
+    def _count(self, source: str, reason: str, count: int, dropped: bool) -> None:
+        key = (source, reason, dropped)
+        if key not in self._refused and len(self._refused) >= MAX_EVENTS:
+            key = ("*", reason, dropped)
+        self._refused[key] += count
+
+    def pending(self) -> int:
+        """Messages queued."""
+        return len(self._queue)
+
+    def waiting_refusals(self) -> Counter[str]:
+        """Refusals by reason that no step has told yet."""
+        waiting: Counter[str] = Counter()
+        for (_, reason, dropped), count in self._refused.items():
+            if not dropped:
+                waiting[reason] += count
+        return waiting
+
+    def names(self) -> tuple[str, ...]:
+        """All sources, sorted."""
+        return tuple(sorted(self.sources))
+
+    def nothing(self) -> Tracks:
+        """No tracks, in the centre's space."""
+        return empty_tracks(len(self.config.space))
+
+    def declared(self, source: Source) -> SourceConfig:
+        """What holds for a source: its own word, else the config's; with `override` the other way round."""
+        said = self.config.source(source.name)
+        if source.info is None or said.override:
+            return said
+        info = source.info
+        return replace(said, period=info.period, motion=info.motion, may_start=info.may_start)
+
+    def ready(self, source: Source) -> bool:
+        """Whether its tracks may be used: it has said what it is, or had a step's time to do so."""
+        return source.info is not None or source.waited > 0 or self.config.source(source.name).override
+
+    def is_stale(self, source: Source, time: int) -> bool:
+        """Whether it has been silent for `stale_periods` of its own periods."""
+        silence = self.config.stale_periods * self.declared(source).period * 1e9
+        return source.last < 0 or time - source.last > silence
+
+    def admit(self, time: int, last: int, journal: Journal) -> list[Order]:
+        """Take all that is queued up to `time`, in canonical order; later messages stay. Returns the orders.
+
+        last: time of the last step, or -1.
+        """
+        self._dead = None
+        for source in self.sources.values():
+            source.waited += len(source.tracks.id) > 0 and source.info is None
+            source.scans = 0
+        for name, found in sorted(self._present.items()):
+            self._presence(name, found, journal)
+        for (name, reason, dropped), count in sorted(self._refused.items()):
+            (journal.drop if dropped else journal.refuse)(Entry(name, 0, 0, 0, reason, count))
+        orders, self._orders = self._orders, []
+        for order in orders:
+            self._order(order, journal)
+        self._present, self._refused = {}, Counter()
+        self._take(self._due(time, journal), time, last, journal)
+        return orders
+
+    def _due(self, time: int, journal: Journal) -> list[_Keyed]:
+        queue, self._queue, self._components = self._queue, [], 0
+        self._held.clear()
+        due: list[_Keyed] = []
+        for event, received in queue:
+            later = isinstance(event, (LocalTracks, LocalIntensity)) and time < event.time <= horizon(
+                received, self.config
+            )
+            if later:
+                self._held[event.source] += 1
+                self._components += _size(event)
+                self._queue.append((event, received))
+                continue
+            try:
+                key = (event.source, event.epoch, event.seq, event.type, digest(event), received)
+            except MessageError as error:
+                journal.refuse(Entry(event.source, 0, 0, 0, error.reason))
+            else:
+                due.append((key, event))
+        due.sort(key=lambda item: item[0])
+        return due
+
+    def _presence(self, name: str, found: bool, journal: Journal) -> None:
+        source = self._admitted(name)
+        if source is None:
+            journal.refuse(Entry(name, 0, 0, 0, "too-many-sources"))
+        elif source.alive is not found:
+            source.alive = found
+            journal.event({"kind": "found" if found else "lost", "source": name})
+
+    def _order(self, order: Order, journal: Journal) -> None:
+        journal.event({"kind": "order", "what": order.what, "source": order.source, "track": order.track})
+        if order.what in ("mute", "unmute"):
+            source = self._admitted(order.source)
+            if source is not None:
+                source.muted = order.what == "mute"
+
+    def _new(self, name: str) -> Source:
+        source = Source(name, self.config.space, self.nothing())
+        source.muted = self.config.source(name).ignore
+        return source
+
+    def _admitted(self, name: str) -> Source | None:
+        """The source of that name, made if there is room: the longest silent dead one goes for it."""
+        if name in self.sources:
+            return self.sources[name]
+        try:
+            check_name(name)
+        except ValueError:
+            return None
+        if len(self.sources) >= MAX_SOURCES:
+            if self._dead is None:
+                dead = [s for s in self.sources.values() if s.alive is not True and not len(s.tracks.id)]
+                self._dead = [s.name for s in sorted(dead, key=lambda s: (s.last, s.name), reverse=True)]
+            if not self._dead:
+                return None
+            del self.sources[self._dead.pop()]
+        self.sources[name] = self._new(name)
+        return self.sources[name]
+
+    def _take(self, messages: list[_Keyed], time: int, last: int, journal: Journal) -> None:
+        tracks: list[tuple[Source, _Scan, Entry]] = []
+        for (name, epoch, seq, kind, code, received), message in messages:
+            entry = Entry(name, epoch, seq, code)
+            known = self.sources.get(name)
+            reason = self._fault(known or self._new(name), message, code, time, last, received)
+            source = None if reason else known or self._admitted(name)
+            if source is None:
+                journal.refuse(replace(entry, reason=reason or "too-many-sources"))
+                if known is not None and reason == "repeat":
+                    known.repeats += 1
+                continue
+            if epoch != source.epoch:
+                if source.epoch >= 0:
+                    journal.event({"kind": "restarted", "source": name, "epoch": epoch})
+                    tracks = [item for item in tracks if item[0] is not source]
+                source.begin(epoch)
+            source.note(kind, seq, code)
+            source.origin = message.origin
+            journal.take(entry)
+            if isinstance(message, SensorInfo):
+                if source.info is None or seq > source.info.seq:
+                    source.info = message
+            elif isinstance(message, _Scan):
+                source.offset = received - message.time
+                tracks.append((source, message, entry))
+        self._apply(tracks, journal)
+
+    def _fault(self, source: Source, message: Message, code: int, time: int, last: int, received: int) -> str:
+        if not isinstance(message, (LocalTracks, LocalIntensity, SensorInfo)):
+            return "type"
+        if source.muted:
+            return "muted"
+        if self.config.name in (message.lineage or ()) or message.source == self.config.name:
+            return "loop"
+        holds = getattr(message, "time", -1)
+        if max(message.epoch, holds) > horizon(received, self.config):
+            return "future"
+        if message.epoch < source.epoch and not self.is_stale(source, time):
+            return "old-epoch"
+        if message.epoch == source.epoch and source.is_repeat(message.type, message.seq, code):
+            return "repeat"
+        if isinstance(message, SensorInfo):
+            return "" if _sound(message) else "bad-info"
+        if last >= 0 and holds < last - round(self.config.lateness * 1e9):
+            return "late"
+        if not set(self.config.space) <= set(message.space):
+            return "space"
+        if isinstance(message, LocalIntensity) is not (self.config.kind == "intensity"):
+            return "intensity" if isinstance(message, LocalIntensity) else "tracks"
+        return "" if _fits(message) else "length"
+
+    def _apply(self, items: list[tuple[Source, _Scan, Entry]], journal: Journal) -> None:
+        codes = check_numbers([item[1] for item in items])
+        checked = [
+            ((source, _as_tracks(message, faults), entry), faults)
+            for (source, message, entry), faults in zip(items, codes, strict=True)
+        ]
+        for _, run in groupby(enumerate(checked), key=_run_key):
+            batch = [item for _, item in run]
+            source, first, _ = batch[0][0]
+            for (_, _, entry), faults in batch:
+                for code in np.unique(faults[faults > 0]).tolist():
+                    journal.refuse(replace(entry, reason=FAULTS[code], count=int((faults == code).sum())))
+            sound = [faults == 0 for _, faults in batch]
+            if self.frame is None:
+                if not any(mask.any() for mask in sound):
+                    continue
+                self.frame = first.frame
+                journal.event({"kind": "frame", "source": source.name})
+            messages = [message for (_, message, _), _ in batch]
+            try:
+                new = message_tracks(
+                    messages, sound, self.frame, self.declared(source).height, self.config.max_components
+                )
+            except FrameError:
+                reason = "frame"
+            else:
+                room = MAX_TOTAL - sum(len(other.tracks.id) for other in self.sources.values() if other is not source)
+                reason = "" if source.apply(messages, new, min(room, MAX_TRACKS)) else "too-many-tracks"
+            if reason:
+                for (_, message, entry), _ in batch:
+                    journal.refuse(replace(entry, reason=reason, count=len(message.ids)))
+
+
+def _run_key(item: tuple[int, tuple[tuple[Source, LocalTracks, Entry], object]]) -> tuple[object, ...]:
+    """Messages in a row that may be taken together: of one source, all partial, in one space and frame."""
+    place, ((source, message, _), _) = item
+    alone = place if message.complete else -1
+    return source.name, alone, message.space, message.frame, message.height
+
+
+def _size(message: Message) -> int:
+    return len(message.means) if isinstance(message, (LocalTracks, LocalIntensity)) else 1
+
+
+def _as_tracks(message: _Scan, faults: NDArray[np.uint8]) -> LocalTracks:
+    """An intensity as a complete scan whose ids no other message has; one without a sound component says nothing.
+    A weight above `MAX_WEIGHT` is marked in `faults`."""
+    if isinstance(message, LocalTracks):
+        return message
+    faults[(faults == 0) & (message.weights > MAX_WEIGHT)] = FAULTS.index("weights")
+    header = {one: getattr(message, one) for one in ("source", "epoch", "seq", "sent", "origin", "lineage")}
+    return LocalTracks(
+        **header,
+        time=message.time,
+        complete=not len(faults) or bool((faults == 0).any()),
+        space=message.space,
+        frame=message.frame,
+        height=message.height,
+        ids=np.arange(len(faults), dtype=np.uint64) + np.uint64((message.seq % 2**44) << 20),
+        existence=message.weights,
+        means=message.means,
+        covariances=message.covariances,
+    )
+
+
+def _fits(message: _Scan) -> bool:
+    """Whether the arrays of a message that was never encoded belong together."""
+    n = len(message.space)
+    if isinstance(message, LocalIntensity):
+        total = len(message.weights)
+        return message.means.shape == (total, n) and message.covariances.shape == (total, n, n)
+    tracks = len(message.ids)
+    total = tracks if message.counts is None else int(np.sum(message.counts))
+    lengths = (message.existence, message.updated, message.counts)
+    return (
+        message.means.shape == (total, n)
+        and message.covariances.shape == (total, n, n)
+        and all(column is None or len(column) == tracks for column in lengths)
+        and (message.weights is None or len(message.weights) == total)
+    )
+
+
+def _sound(info: SensorInfo) -> bool:
+    p, covariance = info.detection_probability, info.position_covariance
+    return (
+        0 < info.period <= MAX_PERIOD
+        and 0 <= info.initiation_delay <= MAX_PERIOD
+        and (p is None or 0 <= p <= 1)
+        and all(math.isfinite(part) for part in info.position)
+        and (covariance is None or bool(np.isfinite(covariance).all()))
+    )

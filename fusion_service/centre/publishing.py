@@ -1,0 +1,108 @@
+"""From the picture after a step to what is published of it: the same for every kind of centre."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.lifecycle import Picture, advance
+from fusion_service.config import CentreConfig
+from fusion_service.densities import Mixtures
+from schemas import ORIGINS, GlobalTracks, Local
+from schemas import messages as words
+
+__all__ = ["Contributions", "live_on", "picture_message"]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Contributions:
+    """Who fed the tracks: counts (G,) per track, and of each of the K contributions source (index into the sorted
+    names), epoch, local id and influence, (K,), track by track."""
+
+    counts: NDArray[np.integer[Any]]
+    source: NDArray[np.intp]
+    epoch: NDArray[np.uint64]
+    id: NDArray[np.uint64]
+    influence: NDArray[np.float64]
+
+
+def live_on(
+    picture: Picture,
+    time: int,
+    support: NDArray[np.intp],
+    fresh: NDArray[np.bool_],
+    config: CentreConfig,
+    journal: Journal,
+) -> tuple[Picture, NDArray[np.bool_]]:
+    """One step of every life, told to the journal: the picture, and which of its tracks (G,) end now."""
+    before = picture.status
+    picture, ended = advance(picture, time, support, fresh, config)
+    for track in picture.id[ended].tolist():
+        journal.end(track, "lost", None)
+    for status, decision in ((words.CONFIRMED, words.CONFIRMED_NOW), (words.COASTING, words.COASTING_NOW)):
+        journal.tracks(decision, picture.id[(picture.status == status) & (before != status) & ~ended])
+    return picture, ended
+
+
+def picture_message(
+    picture: Picture,
+    intake: Intake,
+    journal: Journal,
+    contributions: Contributions,
+    *,
+    epoch: int,
+    seq: int,
+    step: int,
+    time: int,
+    rule: str,
+) -> GlobalTracks:
+    """The message that publishes a picture; its lineage is every source known and the centre itself."""
+    config, names = intake.config, intake.names()
+    origins = {source.origin for source in intake.sources.values() if source.messages}
+    return GlobalTracks(
+        source=config.name,
+        epoch=epoch,
+        seq=seq,
+        sent=time,
+        origin=max(origins, key=ORIGINS.index, default="live"),
+        lineage=(*(name for name in names if name != config.name), config.name),
+        time=time,
+        step=step,
+        rule=rule,
+        space=config.space,
+        frame=intake.frame or Local("none"),
+        ids=picture.id,
+        status=picture.status,
+        existence=picture.existence,
+        **_densities(picture, config.publish),
+        updated=picture.updated,
+        sources=names,
+        contributor_counts=contributions.counts.astype(np.uint16),
+        contributor_source=contributions.source.astype(np.uint16),
+        contributor_epoch=contributions.epoch,
+        contributor_id=contributions.id,
+        contributor_influence=contributions.influence,
+        ended=journal.ended(),
+        split_from=journal.splits(),
+    )
+
+
+def _densities(picture: Picture, publish: str) -> dict[str, Any]:
+    """The columns of a message: mixtures as they are, as their moments, or by their heaviest component."""
+    mean, covariance = picture.mean, picture.covariance
+    if len(picture.log_weight) and publish == "mixture":
+        parts = Mixtures(picture.log_weight, picture.part_mean, picture.part_covariance)
+        weights, means, covariances, counts = parts.rows()
+        return {"means": means, "covariances": covariances, "weights": weights, "counts": counts}
+    if len(picture.log_weight) and publish == "mode":
+        heaviest, each = picture.log_weight.argmax(axis=0), np.arange(len(picture.id))
+        mean, covariance = picture.part_mean[:, heaviest, each], picture.part_covariance[:, :, heaviest, each]
+    return {
+        "means": np.ascontiguousarray(mean.T),
+        "covariances": np.ascontiguousarray(np.moveaxis(covariance, 2, 0)),
+    }

@@ -1,0 +1,35 @@
+"""The local tracks of all sources as one step sees them, in one state space and one order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.centre.sources import Tracks
+
+__all__ = ["NO_TRACK", "Rows"]
+
+NO_TRACK = np.uint64(0)
+"""The link of a track that belongs to no global track."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Rows:
+    """M usable local tracks in canonical order (source, epoch, id).
+
+    source (M,): index into the sorted names. epoch (M,) u64. tracks: their columns, mean (n, M) and covariance
+    (n, n, M) predicted and marginalised to the centre's space; the columns of links may be written. may_start
+    (M,). kept: how many of them each source has, in order.
+    """
+
+    source: NDArray[np.intp]
+    epoch: NDArray[np.uint64]
+    tracks: Tracks
+    may_start: NDArray[np.bool_]
+    kept: dict[str, int]
+
+    def linked(self) -> NDArray[np.intp]:
+        """Rows that belong to a global track."""
+        return np.flatnonzero(self.tracks.link != NO_TRACK)

@@ -1,0 +1,51 @@
+"""What a centre tells of itself after a step."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.sources import Source
+from schemas import Status, StepLog
+
+__all__ = ["step_status"]
+
+
+def step_status(
+    intake: Intake, journal: Journal, log: StepLog, tracks: dict[str, int], refused: dict[str, int]
+) -> Status:
+    """Status after the step of `log`; tracks: how many there are of each kind."""
+    return Status(
+        source=log.source,
+        epoch=log.epoch,
+        seq=log.seq,
+        sent=log.time,
+        time=log.time,
+        step=log.step,
+        uptime=0.0,
+        rates={},
+        queue={"pending": intake.pending()},
+        refused=refused,
+        dropped=dict(sorted(journal.dropped.items())),
+        sources={name: _health(source, intake, journal, log.time) for name, source in sorted(intake.sources.items())},
+        tracks=tracks,
+        step_time={},
+    )
+
+
+def _health(source: Source, intake: Intake, journal: Journal, time: int) -> dict[str, Any]:
+    return {
+        "epoch": max(source.epoch, 0),
+        "alive": source.alive,
+        "stale": intake.is_stale(source, time),
+        "muted": source.muted,
+        "last": source.last,
+        "offset": source.offset / 1e9,
+        "messages": source.messages,
+        "repeats": source.repeats,
+        "gaps": source.gaps,
+        "reordered": source.reordered,
+        "tracks": len(source.tracks.id),
+        "refused": dict(sorted(journal.refused_of.get(source.name, {}).items())),
+    }

@@ -1,7 +1,0 @@
-"""Where a global track of a recording came from, in words and in a view."""
-
-from fusion_service.explain.mission import read_mission
-from fusion_service.explain.track_view import write_view
-from fusion_service.explain.words import explanation, listing
-
-__all__ = ["explanation", "listing", "read_mission", "write_view"]

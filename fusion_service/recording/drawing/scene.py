@@ -1,0 +1,228 @@
+"""Messages become the drawing: picture, charts and log together, and what cannot be drawn is counted."""
+
+from __future__ import annotations
+
+import logging
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import geodesy
+from fusion_service.recording.columns import Columns, Stamp
+from fusion_service.recording.drawing.charts import Charts
+from fusion_service.recording.drawing.drawing import Drawing
+from fusion_service.recording.drawing.errors import Assessment
+from fusion_service.recording.drawing.log import Journal
+from schemas import (
+    FAULTS,
+    Frame,
+    GlobalTracks,
+    LocalIntensity,
+    LocalTracks,
+    Message,
+    SensorInfo,
+    Status,
+    StepLog,
+    Truth,
+    check_numbers,
+)
+
+__all__ = ["Scene"]
+
+log = logging.getLogger(__name__)
+
+PATIENCE = 5.0
+"""Seconds for which the drawing waits for global tracks, to take their frame."""
+AHEAD = 3600 * 10**9
+"""Nanoseconds by which a message may be ahead of the newest global one and still be on the mission's timeline."""
+MAX_SOURCES = 256
+MAX_CENTRES = 32
+MAX_TRACKS = 5000
+"""Sources, centres and scenarios, and tracks of one message, that are drawn; an ellipse takes 600 B. `tables` bounds
+the components."""
+MAX_WAITING = 10_000
+"""Messages that wait for a frame or a mission time."""
+MAX_REASONS = 100
+"""Reasons that are told apart in `undrawn`; what is beyond them is "other"."""
+MAX_ASSESSED = 1000
+"""Tracks and true objects of a step that are assigned to each other."""
+
+Drawable = LocalTracks | LocalIntensity | GlobalTracks | SensorInfo | Truth
+
+
+class Scene:
+    """What a recording shows, written as rows of `columns`. `undrawn`: tracks or messages left out, by reason."""
+
+    def __init__(self, columns: Columns, frame: Frame | None, cutoff: float | None, focus: int | None = None) -> None:
+        self.drawing = Drawing(columns, frame, focus)
+        self.journal = Journal(columns, self.drawing, focus)
+        self.crowded = False
+        """Whether charts have so many series that a legend would hide them."""
+        self.now: int | None = None
+        self._start: int | None = None
+        self.undrawn: Counter[str] = Counter()
+        self._charts = Charts(columns, focus)
+        self._assessment = Assessment(cutoff)
+        self._by_centre = False
+        self._new: list[tuple[Message, Stamp]] = []
+        self._said: set[tuple[str, str]] = set()
+        self._names: dict[bool, set[str]] = {True: set(), False: set()}
+
+    def restart(self) -> None:
+        """A new part of the recording begins."""
+        self._charts.restart()
+        self.drawing.changed = True
+
+    def mission_time(self, message: Message | None) -> int | None:
+        """The time of `message` on the mission's timeline, None where it has none or is impossibly far ahead. That of
+        a status is the service's own until its first step, which may be years from a mission played back."""
+        at: int | None = getattr(message, "time", None)
+        if at is None or isinstance(message, Status):
+            return None
+        from_centre = isinstance(message, GlobalTracks | StepLog)
+        if self._by_centre and not from_centre and self.now is not None and at > self.now + AHEAD:
+            return None
+        if from_centre or not self._by_centre:
+            self._by_centre = from_centre
+            self.now = at if self.now is None or from_centre else max(self.now, at)
+            self._start = at if self._start is None else self._start
+        return at
+
+    def add(self, message: Message, stamp: Stamp) -> None:
+        """Take a message for the next `draw`; without a mission time it is drawn at that of its arrival."""
+        if isinstance(message, LocalTracks | LocalIntensity | Truth) and stamp.time is None:
+            self._leave_out(message.source, "its time is far ahead", 1, stamp._replace(time=self.now))
+        else:
+            self._new.append((message, stamp if stamp.time is not None else stamp._replace(time=self.now)))
+        if len(self._new) > MAX_WAITING and self.drawing.chart is None:
+            self._new.pop(0)
+            self._leave_out(message.source, "nothing has said a frame and a time yet", 1, stamp)
+
+    def alive(self, scope: str, name: str, alive: bool, stamp: Stamp) -> None:
+        """A liveliness token came or went."""
+        self.journal.alive(scope, name, alive, stamp)
+        if not alive and scope == "local" and stamp.time is not None:
+            self.drawing.clear(name, stamp)
+
+    def draw(self, patience: float = PATIENCE) -> None:
+        """Add the rows of all that was taken; what needs a frame waits for it, at most `patience` seconds."""
+        ready = self._open_chart(patience)
+        drawn = [item for item in self._new if ready or not _needs_chart(item[0])]
+        self._new = [item for item in self._new if not ready and _needs_chart(item[0])]
+        tracks = [message for message, _ in drawn if isinstance(message, LocalTracks | LocalIntensity | GlobalTracks)]
+        faults = dict(zip(map(id, tracks), check_numbers(tracks), strict=True))
+        for message, stamp in drawn:
+            stamp = stamp if stamp.time is not None else stamp._replace(time=self._start)
+            if reason := self._unfit(message):
+                self._leave_out(message.source, reason, 1, stamp)
+                continue
+            fault = faults.get(id(message), np.zeros(0, dtype=np.uint8))
+            for code in np.unique(fault[fault != 0]).tolist():
+                self._leave_out(message.source, FAULTS[code], int((fault == code).sum()), stamp)
+            with self._guard(message.source, stamp):
+                self._draw_one(message, fault == 0, stamp)
+        if drawn:
+            with self._guard("truth", drawn[-1][1]._replace(time=self.now)):
+                for score in self._assessment.scores():
+                    over = self._charts.score(score, self.drawing.centres)
+                    if over:
+                        self._leave_out(score.centre, "too many targets", over, score.stamp)
+        self.drawing.colour_sources()
+        if self.crowded != self._charts.crowded:
+            self.crowded = self.drawing.changed = True
+
+    def _open_chart(self, patience: float) -> bool:
+        """Whether the frame of the drawing, and a mission time, are known; takes the frame if it is time to."""
+        if self.drawing.chart is None and self._new:
+            messages = [message for message, _ in self._new]
+            best: list[Drawable] = [m for m in messages if isinstance(m, GlobalTracks) and len(m.ids)]
+            if not best and self._new[-1][1].received - self._new[0][1].received >= patience * 1e9:
+                best = [m for m in messages if isinstance(m, LocalTracks | LocalIntensity | Truth)]
+                best += [m for m in messages if isinstance(m, SensorInfo)]
+            if best:
+                self.drawing.open_chart(best[0])
+        return self.drawing.chart is not None and self.now is not None
+
+    def _unfit(self, message: Message) -> str:
+        """Why a message as a whole is not drawn; empty if it is."""
+        if isinstance(message, GlobalTracks | Status | StepLog | Truth):
+            known = self._names[isinstance(message, Truth)]
+            if message.source not in known and len(known) >= MAX_CENTRES:
+                return f"more than {MAX_CENTRES} {'scenarios' if isinstance(message, Truth) else 'centres'}"
+            known.add(message.source)
+        if isinstance(message, LocalTracks | GlobalTracks | Truth) and len(message.ids) > MAX_TRACKS:
+            return f"more than {MAX_TRACKS} tracks"
+        new = isinstance(message, LocalTracks | LocalIntensity | SensorInfo)
+        if new and message.source not in self.drawing.sources and len(self.drawing.sources) >= MAX_SOURCES:
+            return f"more than {MAX_SOURCES} sources"
+        return ""
+
+    def _draw_one(self, message: Message, sound: NDArray[np.bool_], stamp: Stamp) -> None:
+        drawing, charts, journal = self.drawing, self._charts, self.journal
+        if isinstance(message, LocalTracks | LocalIntensity | SensorInfo):
+            journal.begin("source", message.source, message.epoch, stamp)
+        elif isinstance(message, GlobalTracks | Status):
+            journal.begin("service", message.source, message.epoch, stamp)
+        if isinstance(message, Status):
+            for source in journal.status(message, stamp):
+                drawing.clear(source, stamp)
+        elif isinstance(message, StepLog):
+            journal.step(message, stamp)
+        elif isinstance(message, SensorInfo):
+            drawing.sensor(message, stamp)
+        elif isinstance(message, Truth):
+            if self._assessable(message, stamp):
+                self._assessment.truth(message)
+            drawing.truth(message, stamp)
+        elif isinstance(message, GlobalTracks):
+            journal.tracks(message, stamp)
+            if self._assessable(message, stamp):
+                self._assessment.step(message, stamp)
+            if drawing.chart is not None:
+                self._too_many(message, "components", drawing.global_tracks(message, sound, stamp), stamp)
+            unseen = charts.step(message, drawing.colours, drawing.centres, drawing.label, stamp)
+            self._too_many(message, "series of existence", unseen, stamp)
+        else:
+            if isinstance(message, LocalTracks):
+                over = drawing.local_tracks(message, sound, stamp)
+            else:
+                over = drawing.intensity(message, sound, stamp)
+            self._too_many(message, "components", over, stamp)
+            charts.local(message, drawing.colours, stamp)
+
+    def _too_many(self, message: Message, what: str, count: int, stamp: Stamp) -> None:
+        if count:
+            self._leave_out(message.source, f"too many {what}", count, stamp)
+
+    def _assessable(self, message: GlobalTracks | Truth, stamp: Stamp) -> bool:
+        few = len(message.ids) <= MAX_ASSESSED
+        if not few:
+            self._leave_out(message.source, f"more than {MAX_ASSESSED} tracks to assess", 1, stamp)
+        return few
+
+    @contextmanager
+    def _guard(self, source: str, stamp: Stamp) -> Iterator[None]:
+        """What cannot be drawn is counted; its bytes are on file already."""
+        try:
+            yield
+        except geodesy.FrameError as error:
+            self._leave_out(source, str(error), 1, stamp)
+        except Exception as error:
+            log.exception("cannot draw a message of %s", source)
+            self._leave_out(source, type(error).__name__, 1, stamp)
+
+    def _leave_out(self, source: str, reason: str, count: int, stamp: Stamp) -> None:
+        """Count, and say so the first time for each source and reason."""
+        if reason not in self.undrawn and len(self.undrawn) >= MAX_REASONS:
+            reason = "other"
+        self.undrawn[reason] += count
+        if (source, reason) not in self._said and len(self._said) < MAX_SOURCES:
+            self._said.add((source, reason))
+            self.journal.say("recorder", "WARN", f"{source}: {count} not drawn: {reason} (said once)", stamp)
+
+
+def _needs_chart(message: Message) -> bool:
+    return isinstance(message, Drawable) and not (isinstance(message, GlobalTracks) and not len(message.ids))

@@ -1,0 +1,1 @@
+"""What is done with a recording: scored, explained, fused again, exported, drawn."""

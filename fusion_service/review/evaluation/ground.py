@@ -1,0 +1,122 @@
+"""On what all of a mission are scored: frame, times, true positions, and how long each source's tracks are shown."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.errors import ReviewError
+from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.snapshots import STALE_PERIODS, STALE_STEPS, truth_path, truth_positions
+from schemas import Frame, Motion, Truth
+
+__all__ = ["Ground", "NothingToScoreError", "ScoredTruth", "all_times", "lay_ground", "scored_truth"]
+
+Floats = NDArray[np.float64]
+Times = NDArray[np.int64]
+
+MOST_TIMES = 5_000_000
+
+
+class NothingToScoreError(ReviewError):
+    """There is nothing to score, or not what was asked for."""
+
+
+class Ground(NamedTuple):
+    """What all are scored on. sources: those that can be; motions, limits (s): of each of them and of each centre."""
+
+    frame: Frame
+    axes: tuple[str, ...]
+    speeds: tuple[str, ...]
+    sources: list[str]
+    centres: list[str]
+    left_out: dict[str, str]
+    motions: dict[tuple[str, str], Motion]
+    limits: dict[tuple[str, str], float]
+    c: float
+
+
+class ScoredTruth(NamedTuple):
+    """times (K,), ids of T targets, their states (K, T, m)."""
+
+    times: Times
+    targets: tuple[int, ...]
+    states: Floats
+
+
+def lay_ground(
+    book: Logbook,
+    centres: Sequence[str],
+    frame: Frame | None,
+    space: tuple[str, ...] | None,
+    motion: Motion | None,
+    c: float,
+) -> Ground:
+    for name in centres:
+        if name not in book.centres:
+            there = ", ".join(book.centres) or "none"
+            raise NothingToScoreError(f"no tracks of a centre {name!r} (there are: {there})")
+    if centres:
+        first = book.first_pictures[centres[0]]
+        frame, space = frame or first.frame, space or first.space
+    if frame is None or space is None:
+        raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
+    axes = tuple(name for name in "xyz" if name in space)
+    left_out = {name: reason for name in book.sources if (reason := book.unreachable(name, frame, axes))}
+    sources = [name for name in book.sources if name not in left_out]
+    motions: dict[tuple[str, str], Motion] = {}
+    limits: dict[tuple[str, str], float] = {}
+    for name in sources:
+        info = book.infos.get(name)
+        period = info.period if info else book.traffic["local", name].interval
+        motions["local", name] = info.motion if info else motion or Motion("cv", 1.0)
+        limits["local", name] = STALE_PERIODS * period
+    drift = Motion("cv", max((book.infos[name].motion.q for name in sources if name in book.infos), default=1.0))
+    for name in centres:
+        motions["global", name] = drift
+        limits["global", name] = STALE_STEPS * book.traffic["global", name].interval
+    speeds = tuple(f"v{name}" for name in axes)
+    return Ground(frame, axes, speeds, sources, list(centres), left_out, motions, limits, c)
+
+
+def scored_truth(
+    truths: Sequence[Truth], ground: Ground, pictures: Times | None, every: float | None, gap: float
+) -> ScoredTruth:
+    """ValueError where there is none."""
+    if every is None and pictures is None:
+        raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
+    paths = truth_path(truths, ground.frame, ground.axes, ground.speeds)
+    if not paths:
+        raise NothingToScoreError("no truth to score against")
+    first, last = min(int(known[0]) for known, _ in paths.values()), max(int(known[-1]) for known, _ in paths.values())
+    if every is None:
+        assert pictures is not None
+        times = pictures[(pictures >= first) & (pictures <= last)]
+    else:
+        times = _multiples(first, last, every)
+    if not len(times):
+        raise NothingToScoreError(
+            "no time to score: no picture of the centre, or no multiple of every, while there is truth"
+        )
+    states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
+    states[~np.isfinite(states[:, :, : len(ground.axes)]).all(axis=2)] = np.nan
+    return ScoredTruth(times, tuple(paths), states)
+
+
+def all_times(book: Logbook, pictures: Times | None, every: float | None) -> Times:
+    if every is None:
+        return pictures if pictures is not None else np.zeros(0, dtype=np.int64)
+    return _multiples(*book.span, every) if book.span else np.zeros(0, dtype=np.int64)
+
+
+def _multiples(first: int, last: int, every: float) -> Times:
+    step = max(round(every * 1e9), 1)
+    if (count := (last - first) // step) > MOST_TIMES:
+        raise NothingToScoreError(
+            f"{count} times every {every:g} s: a clock is wrong, or every (--every) is too short, for a mission of "
+            f"{(last - first) / 1e9:.4g} s"
+        )
+    return np.arange(-(-first // step), last // step + 1, dtype=np.int64) * step

@@ -1,0 +1,180 @@
+"""What `evaluate` says of one or more recordings: on a terminal, and as plain values for JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from fusion_service.review.evaluation.assess import Assessment
+from fusion_service.review.evaluation.scoring import plain
+from fusion_service.review.evaluation.tables import (
+    NUMBERS,
+    Row,
+    aligned,
+    comparison,
+    confirm_line,
+    format_table,
+    rules_table,
+    sentence,
+    tracking_table,
+    truthless_lines,
+)
+
+__all__ = ["facts", "label", "results", "rows_of", "rule_of", "text", "utc"]
+
+
+def rule_of(assessment: Assessment, centre: str) -> str:
+    """The rule that a centre's pictures name most often."""
+    account = assessment.book.accounts.get(centre)
+    named = account.rules.most_common(1) if account else []
+    return named[0][0] if named else "no centre"
+
+
+def rows_of(assessments: Sequence[Assessment]) -> list[Row]:
+    """A row for each centre that could be scored."""
+    return [
+        Row(label(one), centre, rule_of(one, centre), evaluation)
+        for one in assessments
+        for centre, evaluation in one.evaluations.items()
+    ]
+
+
+def label(assessment: Assessment) -> str:
+    path = assessment.book.path
+    return (path.parent.name if path.stem == "mission" and path.parent.name else path.stem) if path else ""
+
+
+def utc(time: int) -> str:
+    """ISO 8601 to the second."""
+    return datetime.fromtimestamp(time // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
+
+
+def facts(assessment: Assessment) -> dict[str, str]:
+    """The mission in a few lines."""
+    book = assessment.book
+    span = book.span
+    sources = [
+        f"{name} ({one.tracks} {'tracks' if kind == 'local' else 'components'})"
+        for (kind, name), one in sorted(book.traffic.items())
+        if kind != "global"
+    ]
+    centres = [
+        f"{name}: {rule_of(assessment, name)}, {book.traffic['global', name].messages} pictures"
+        + (f", {len(book.accounts[name].runs)} runs" if len(book.accounts[name].runs) > 1 else "")
+        for name in book.centres
+    ]
+    found = {
+        "recording": str(book.path) if book.path else "in memory",
+        "mission time": f"{utc(span[0])} to {utc(span[1])}, {(span[1] - span[0]) / 1e9:g} s" if span else "none",
+        "origin": ", ".join(sorted(book.origins)),
+        "sources": ", ".join(sources) or "none",
+        "centres": "; ".join(centres) or "none",
+        "messages": ", ".join(f"{count} {kind.replace('_', ' ')}" for kind, count in sorted(book.counts.items())),
+    }
+    if book.bad:
+        found["not read"] = ", ".join(f"{count} messages: {reason}" for reason, count in sorted(book.bad.items()))
+    chosen = " (chosen: about 10 times the typical standard deviation)" if assessment.chosen else ""
+    found["cut-off"] = f"{assessment.c:g} m{chosen}"
+    return found
+
+
+def text(assessments: Sequence[Assessment]) -> str:
+    """The plain summary: first in words, then tables; of several centres of a recording the tables of the first."""
+    rows, lines = rows_of(assessments), []
+    if rows:
+        lines.append(sentence(rows[0]) if len(rows) == 1 else comparison(rows))
+    lines += [f"{label(one) or 'The mission'}: {one.unscored}." for one in assessments if one.unscored]
+    if len(rows) > 1:
+        lines += ["", *aligned(rules_table(rows), left=len(rules_table(rows)[0]) - NUMBERS)]
+    for one in assessments:
+        centre = next(iter(one.evaluations), next(iter(one.agreements), ""))
+        lines += ["", f"{one.book.path or 'mission'}" + (f", cut-off {facts(one)['cut-off']}" if one.chosen else "")]
+        if one.book.bad:
+            lines.append(f"not read: {facts(one)['not read']}")
+        if one.evaluations:
+            evaluation = one.evaluations[centre]
+            if len(one.evaluations) > 1:
+                lines.append(f"of {centre} (--centre NAME shows another, --html and --json all of them):")
+            scored = {**evaluation.sources, **({"fused": evaluation.fused} if evaluation.centre else {})}
+            lines += [format_table(evaluation), ""]
+            lines += [*aligned(tracking_table(scored, len(evaluation.targets))), confirm_line(evaluation)]
+        lines += ["", *truthless_lines(one, centre)]
+    return "\n".join(line for k, line in enumerate(lines) if line or k == 0 or lines[k - 1])
+
+
+def results(assessments: Sequence[Assessment]) -> dict[str, Any]:
+    """All numbers. `rows`: one for each centre of each recording, with the keys of `Evaluation.as_json` and, as `more`,
+    the rest; `recordings`: what needs no truth."""
+    rows = []
+    for one in assessments:
+        path = str(one.book.path or "")
+        for centre, evaluation in one.evaluations.items():
+            told = evaluation.as_json(Path(path).stem, rule_of(one, centre), path)
+            rows.append({**told, "more": evaluation.more_json()})
+    return {"rows": rows, "recordings": [_recording(one) for one in assessments]}
+
+
+def _recording(one: Assessment) -> dict[str, Any]:
+    book = one.book
+    return {
+        "recording": str(book.path or ""),
+        "span_ns": list(book.span) if book.span else None,
+        "messages": dict(book.counts),
+        "not_read": dict(book.bad),
+        "unscored": one.unscored,
+        "cutoff": one.c,
+        "cutoff_chosen": one.chosen,
+        "traffic": {
+            f"{kind}/{name}": {
+                "messages": traffic.messages,
+                "tracks": traffic.tracks,
+                "interval": traffic.interval,
+                "epochs": traffic.epochs,
+                "missing": traffic.missing,
+                "silent": traffic.silent,
+                "silences_ns": [list(span) for span in traffic.silences],
+            }
+            for (kind, name), traffic in sorted(book.traffic.items())
+        },
+        "latency": {
+            f"{kind}/{name}": {key: plain(getattr(delay, key)) for key in delay._fields}
+            for (kind, name), delay in sorted(book.latency.items())
+        },
+        "centres": {name: _centre(one, name) for name in sorted(book.accounts)},
+    }
+
+
+def _centre(one: Assessment, name: str) -> dict[str, Any]:
+    account, agreement = one.book.accounts[name], one.agreements.get(name)
+    reasons = {"refused": account.refused, "dropped": account.dropped}
+    return {
+        "rules": dict(account.rules),
+        "runs": len(account.runs),
+        "steps": account.steps,
+        "confirmed_by_sources": {str(n): count for n, count in sorted(account.shown.items())},
+        "ended": dict(account.ended),
+        **{
+            verb: [
+                {"source": source, "reason": reason, "what": what, "count": count}
+                for (source, reason, what), count in sorted(counter.items())
+            ]
+            for verb, counter in reasons.items()
+        },
+        "links": {
+            source: {
+                "kept": account.kept[source],
+                "gate_failed": account.failed[source],
+                "broken": account.broken[source],
+                "compared": n,
+                "mean_d2_over_n": plain(total / n / account.dimension if n and account.dimension else float("nan")),
+            }
+            for source, (n, total) in sorted(account.innovation.items())
+        },
+        "agreement": [
+            {"sources": list(pair), "pairs": found.n, "mean": plain(found.mean), "bounds": plain(found.bounds)}
+            for pair, found in (agreement.pairs.items() if agreement else ())
+        ],
+        "step_time": account.status.step_time if account.status else {},
+    }

@@ -1,0 +1,349 @@
+"""Where a global track came from, in words: its life as a timeline, what each source brought, what became of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from datetime import UTC, datetime
+
+import numpy as np
+
+from fusion_service.densities import moments
+from fusion_service.errors import ReviewError
+from fusion_service.review.explain.lives import GONE, Life
+from fusion_service.review.explain.mission import Mission, Refusals
+from fusion_service.review.explain.story import Happening, Link, Member, Moment, Story, local_messages
+from schemas import STATUSES, LocalTracks
+from schemas.messages import COASTING, TENTATIVE
+
+__all__ = ["explanation", "listing"]
+
+RUNNING = ("kept", "outside its gate")
+SPELLS = 6
+"""Spells of a link inside and outside its gate that are told one by one."""
+LONGEST_CHAIN = 20
+MOST_LINES = 200
+MARGIN = 10.0
+"""Seconds around a life in which refusals are told."""
+
+
+def explanation(mission: Mission) -> str:
+    """The story of `mission.story` in words."""
+    story = mission.story
+    assert story is not None
+    if story.until is not None and (story.until < story.first or story.moment is None):
+        raise ReviewError(
+            f"track {mission.labels(story.track)} was not there at {mission.seconds(story.until):.1f} s: "
+            f"it lived from {mission.seconds(story.first):.1f} to {mission.seconds(story.last):.1f} s"
+        )
+    teller = _Teller(mission, story)
+    blocks = [teller.header(), teller.timeline(), teller.contributions(), teller.summary()]
+    return "\n\n".join("\n".join(block) for block in blocks if block)
+
+
+def listing(mission: Mission, *, everything: bool = False) -> str:
+    """The tracks of a mission, a line each: those that were ever confirmed, or all."""
+    lives = sorted(mission.lives, key=lambda one: (one.first, one.track))
+    shown = [one for one in lives if one.confirmed or everything]
+    rows = [["track", "from s", "to s", "life s", "events", "sources", "became"]]
+    for one in shown:
+        until = mission.lives.until(one)
+        first, last = mission.seconds(one.first), mission.seconds(until)
+        sources = " ".join(sorted(one.sources)) or "-"
+        numbers = [f"{value:.1f}" for value in (first, last, last - first)]
+        rows.append([mission.labels(one.track), *numbers, str(one.events), sources, _became(mission, one)])
+    head = f"{mission.path}: centre {mission.centre.name}, {mission.steps} steps from {_utc(mission.start)}"
+    left = len(lives) - len(shown)
+    never = f"; {left} more were never confirmed (--all lists them)" if left else ""
+    count = f"{len(shown)} track{'s' * (len(shown) != 1)}"
+    tail = f"{count}{never}. Ask for one: fusion-service explain {mission.path} --track NUMBER"
+    return "\n".join([head, *_table(rows, left=(0, 5, 6)), tail])
+
+
+def _became(mission: Mission, life: Life) -> str:
+    label = mission.labels
+    parts = [] if life.parent is None else [f"split from {label(life.parent)}"]
+    parts += [f"took in {', '.join(map(label, life.took))}"] if life.took else []
+    if life.ended is None:
+        return "; ".join([*parts, "there at the end"])
+    _, reason, heir = life.ended
+    return "; ".join([*parts, reason if heir is None else f"{reason} into {label(heir)}"])
+
+
+class _Teller:
+    """Writes the blocks of one story."""
+
+    def __init__(self, mission: Mission, story: Story) -> None:
+        self.mission, self.story = mission, story
+        self.label = mission.labels
+        self.new_gate, self.gate = mission.gates()
+        sources = [source for source, _, _ in story.links]
+        runs = {(source, epoch) for source, epoch, _ in story.links}
+        self._epochs = {source: sorted(epoch for one, epoch in runs if one == source) for source in set(sources)}
+
+    def time(self, at: int) -> str:
+        return f"{self.mission.seconds(at):.1f}"
+
+    def name(self, member: Member) -> str:
+        """`radar1 3`; the run of the source where there were several."""
+        source, epoch, local = member
+        runs = self._epochs.get(source, [])
+        run = f" (run {runs.index(epoch) + 1})" if len(runs) > 1 and epoch in runs else ""
+        intensity = self.mission.config is not None and self.mission.config.kind == "intensity"
+        return f"{source}{'' if intensity else f' {local}'}{run}"
+
+    def names(self, members: Iterable[Member]) -> str:
+        found = [self.name(member) for member in members]
+        return found[0] if len(found) == 1 else f"{', '.join(found[:-1])} and {found[-1]}" if found else "nobody"
+
+    def header(self) -> list[str]:
+        mission, story, track = self.mission, self.story, self.story.track
+        gates = ""
+        if math.isfinite(self.gate):
+            gates = f"; gates on d2: {self.new_gate:.1f} for a new link, {self.gate:.1f} for a standing one"
+        status = ", ".join(f"{story.status[name]} {name}" for name in STATUSES if story.status[name])
+        low, high = story.existence
+        existence = f"existence {low:.2g}" if low == high else f"existence {low:.2g} to {high:.2g}"
+        whole = f" (id {track}, generation {track >> 32})" if track >> 32 else ""
+        span = f"{self.time(story.first)} to {self.time(story.last)} s"
+        return [
+            f"track {self.label(track)}{whole} of centre {mission.centre.name} in {mission.path}",
+            f"mission from {_utc(mission.start)}, {mission.steps} steps, rule {mission.rule}{gates}",
+            f"lived from {span}, {story.steps} steps: {status}; {existence}",
+        ]
+
+    def timeline(self) -> list[str]:
+        rows = [("s", "what")]
+        told = sorted(_compact(self.story.happenings), key=lambda one: (one.first, one.what != "born"))
+        lines = [(one.first, self._span(one.first, one.last), self._what(one)) for one in told]
+        lines += [(one.first, self._span(one.first, one.last), self._refusal(one)) for one in self._refusals()]
+        if self.story.ended is not None:
+            at = self.story.ended[0]
+            lines.append((at, self.time(at), f"ended: {self._end()}"))
+        lines.sort(key=lambda one: one[0])
+        rows += [line[1:] for line in lines]
+        if len(rows) > MOST_LINES:
+            half = MOST_LINES // 2
+            rows = [*rows[:half], ("...", f"{len(rows) - 2 * half} lines left out"), *rows[-half:]]
+        width = max(len(row[0]) for row in rows)
+        return [f"{when:<{width}}  {what}" for when, what in rows]
+
+    def _span(self, first: int, last: int) -> str:
+        return self.time(first) if first == last else f"{self.time(first)}-{self.time(last)}"
+
+    def _what(self, one: Happening) -> str:
+        whom = f"{self.name(one.member)} " if one.member is not None else ""
+        other = f" {self.label(one.other)}" if one.other is not None else ""
+        steps = f" {one.steps} steps" if one.what.startswith(RUNNING) and one.steps > 1 else ""
+        return f"{whom}{one.what}{other}{steps}{self._distance(one)}"
+
+    def _distance(self, one: Happening) -> str:
+        if not math.isfinite(one.low):
+            return ", alone" if one.what == "kept" else ""
+        span = "-".join(dict.fromkeys((f"{one.low:.1f}", f"{one.high:.1f}")))
+        gate = self.gate if one.what.startswith(("kept", "outside", "broken")) else self.new_gate
+        return f", d2 {span}" + (f" of gate {gate:.1f}" if math.isfinite(gate) else "")
+
+    def _refusals(self) -> list[Refusals]:
+        sources = {member[0] for member in self.story.links}
+        early, late = self.story.first - MARGIN * 1e9, self.story.last + MARGIN * 1e9
+        runs = self.mission.refusals
+        return [one for one in runs if one.source in sources and one.last >= early and one.first <= late]
+
+    def _refusal(self, one: Refusals) -> str:
+        parts = [f"{one.messages} messages"] if one.messages else []
+        parts += [f"{one.tracks} tracks"] if one.tracks else []
+        return f"{one.source}: {' and '.join(parts)} refused ({one.reason})"
+
+    def contributions(self) -> list[str]:
+        """What each member brought, at the moment and over the life of the track."""
+        moment, story = self.story.moment, self.story
+        if moment is None or not story.links:
+            return []
+        said = {member: _said(member, moment) for member in moment.influence}
+        rows = [["source and track", "influence", "mean", "least", "most", "steps", "d2", "age s", "sigma m", "says"]]
+        for member in sorted(story.links, key=lambda one: (one not in moment.influence, one)):
+            link = story.links[member]
+            age, sigma, identity = said.get(member, ("", "", ""))
+            here = f"{moment.influence[member]:.2f}" if member in moment.influence else "-"
+            d2 = f"{moment.values[member]:.1f}" if math.isfinite(moment.values.get(member, math.nan)) else "-"
+            rows.append([self.name(member), here, *_over_life(link), str(link.steps), d2, age, sigma, identity])
+        if not any(row[-1] for row in rows[1:]):
+            rows = [row[:-1] for row in rows]
+        at = moment.picture.time
+        status = STATUSES[moment.picture.status[moment.row]]
+        head = f"contributions at {self.time(at)} s (step {moment.picture.step}, {status}), and over its life:"
+        return [head, *_table(rows, left=(0, 9))]
+
+    # In plain words
+
+    def summary(self) -> list[str]:
+        return [" ".join([*self._began(), *self._lived(), *self._became()])]
+
+    def _began(self) -> list[str]:
+        story, name = self.story, self.label(self.story.track)
+        born = next((one for one in story.happenings if one.what == "born"), None)
+        split = next((one for one in story.happenings if one.what == "split from"), None)
+        life = self.mission.lives.known[story.track]
+        at = self.time(story.first)
+        if born is None:
+            why = "when the recording of it begins"
+            return [f"Track {name} was there already at {at} s, {why}."]
+        founders = [member for member, link in story.links.items() if link.first == born.first]
+        text = f"Track {name} was born at {self.time(born.first)} s from {self.names(founders)}"
+        parent = split.other if split is not None else life.parent
+        if parent is not None:
+            text += f", split from track {self.label(parent)} with which it no longer agreed"
+        confirmed = next((one for one in story.happenings if one.what == "confirmed"), None)
+        if confirmed is None:
+            return [f"{text}; it was never confirmed."]
+        when = "at once" if confirmed.first == born.first else f"{(confirmed.first - born.first) / 1e9:.1f} s later"
+        ancestors = self._chain(parent, lambda life: life.parent, "was itself split from")
+        return [f"{text}, and confirmed {when}.", *ancestors]
+
+    def _lived(self) -> list[str]:
+        story = self.story
+        said = []
+        late = [one for one in story.links if story.links[one].first > story.first]
+        if late:
+            said.append(f"{self.names(late)} joined later.")
+        for one in story.happenings:
+            at = self.time(one.first)
+            if one.what == "broken off" and one.member is not None:
+                said.append(f"{self.name(one.member)} was broken off at {at} s: too far from the others.")
+            elif one.what == "took in" and one.other is not None:
+                said.append(f"It took in track {self.label(one.other)} at {at} s.")
+            elif one.what == "split off it:" and one.other is not None:
+                said.append(f"Track {self.label(one.other)} was split off it at {at} s.")
+        if story.status["coasting"]:
+            said.append(f"It coasted for {story.status['coasting']} of its {story.steps} steps.")
+        heavy = sorted(story.links, key=lambda one: -story.links[one].total)[:3]
+        total = sum(story.links[one].total for one in story.links)
+        if total > 0:
+            parts = [f"{self.name(one)} {story.links[one].total / total:.0%}" for one in heavy]
+            said.append(f"Over its life its data came from {', '.join(parts)}.")
+        return said
+
+    def _became(self) -> list[str]:
+        story = self.story
+        if story.ended is None:
+            return ["It was still there at the end of the recording."]
+        at, _, heir = story.ended
+        text = f"It ended at {self.time(at)} s: {self._end()}."
+        if heir is None:
+            return [text]
+        return [
+            text,
+            *self._chain(heir, lambda life: life.ended[2] if life.ended is not None else None, "was merged into"),
+        ]
+
+    def _end(self) -> str:
+        """Why it ended."""
+        story, config = self.story, self.mission.config
+        assert story.ended is not None
+        at, reason, heir = story.ended
+        if heir is not None:
+            return f"{reason} into track {self.label(heir)}, the older one, with which it agreed"
+        if reason == "ordered":
+            return "deleted by an operator's order"
+        if reason == GONE:
+            return "the next picture does not show it, and no log says why"
+        if story.newest is None:
+            return reason
+        picture, row = story.newest
+        silent = (at - story.supported) / 1e9
+        if config is not None and picture.existence[row] < config.min_existence:
+            return f"its existence fell below {config.min_existence:g} (min_existence) without a source"
+        if picture.status[row] == TENTATIVE and not (config is not None and silent > config.coast):
+            return f"no source had it any more after {self.time(story.supported)} s, and it was tentative"
+        if picture.status[row] == COASTING or silent > 0:
+            limit = f", longer than {config.coast:g} s (coast)" if config is not None else ""
+            return f"no source had it for {silent:.1f} s{limit}"
+        return reason
+
+    def _chain(self, track: int | None, following: Callable[[Life], int | None], how: str) -> list[str]:
+        """A sentence for each track of a line of ancestors or heirs."""
+        said: list[str] = []
+        seen = {self.story.track}
+        while track is not None and track not in seen and len(said) < LONGEST_CHAIN:
+            seen.add(track)
+            life = self.mission.lives.known.get(track)
+            if life is None:
+                break
+            until = self.time(self.mission.lives.until(life))
+            text = f"Track {self.label(track)}, from {', '.join(sorted(life.sources)) or 'no source'}, lived from"
+            text = f"{text} {self.time(life.first)} to {until} s"
+            track = following(life)
+            said.append(f"{text} and {how} {self.label(track)}." if track is not None else f"{text}.")
+        return said
+
+
+def _compact(happenings: Sequence[Happening]) -> list[Happening]:
+    """The same, with the spells of a link inside and outside its gate as one where they are many."""
+    spells: dict[Member, list[Happening]] = {}
+    told: list[Happening] = []
+    closed: list[list[Happening]] = []
+    for one in happenings:
+        if one.member is not None and one.what in RUNNING:
+            spells.setdefault(one.member, []).append(one)
+            continue
+        told.append(one)
+        if one.member is not None and one.member in spells:
+            closed.append(spells.pop(one.member))
+    for some in (*closed, *spells.values()):
+        told += some if len(some) <= SPELLS else [_joined(some)]
+    return told
+
+
+def _joined(some: Sequence[Happening]) -> Happening:
+    kept, outside = ([one for one in some if one.what == what] for what in RUNNING)
+    steps = sum(one.steps for one in outside)
+    what = f"kept {sum(one.steps for one in kept)} steps, outside its gate {steps} in {len(outside)} spells"
+    low, high = np.fmin.reduce([one.low for one in some]), np.fmax.reduce([one.high for one in some])
+    return Happening(
+        some[0].first, max(one.last for one in some), what, some[0].member, None, 1, float(low), float(high)
+    )
+
+
+def _over_life(link: Link) -> list[str]:
+    if not math.isfinite(link.least):
+        return ["-", "-", "-"]
+    return [f"{value:.2f}" for value in (link.total / link.steps, link.least, link.most)]
+
+
+def _said(member: Member, moment: Moment) -> tuple[str, str, str]:
+    """Of the newest message of a member's source that holds it: age (s), standard deviation of its position (m), and
+    what it says that it is."""
+    source, epoch, local = member
+    for message in reversed(local_messages(moment.recent.get(source, ()))):
+        if message.epoch != epoch or message.time > moment.picture.time:
+            continue
+        age = f"{(moment.picture.time - message.time) / 1e9:.1f}"
+        if not isinstance(message, LocalTracks):
+            return age, "", ""
+        rows = np.flatnonzero(message.ids == np.uint64(local))
+        if not len(rows):
+            continue
+        row = int(rows[0])
+        _, covariances = moments(message.means, message.covariances, message.weights, message.counts)
+        places = [message.space.index(name) for name in "xyz" if name in message.space]
+        variance = float(np.mean(covariances[row][places, places]))
+        says = [column[row] for column in (message.identity, message.kind) if column is not None]
+        return age, f"{math.sqrt(max(variance, 0.0)):.3g}", " ".join(one for one in says if one)
+    return "", "", ""
+
+
+def _table(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:
+    """Rows in columns, those of `left` to the left."""
+    widths = [max(len(row[k]) for row in rows) for k in range(len(rows[0]))]
+    lines = []
+    for row in rows:
+        cells = [
+            f"{cell:<{w}}" if k in left else f"{cell:>{w}}" for k, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ]
+        lines.append("  ".join(cells).rstrip())
+    return lines
+
+
+def _utc(at: int) -> str:
+    return datetime.fromtimestamp(at // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

@@ -1,0 +1,90 @@
+"""The settings that a replay begins from: those of the mission's own log, or of a config file."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from fusion_service import __version__
+from fusion_service.config import CentreConfig, ConfigError, centre_config, config_hash
+from fusion_service.config.settings import nested, plain_settings
+from fusion_service.errors import ReviewError
+from fusion_service.recording.survey import RecordedCentre, Survey
+from fusion_service.review.replay.variants import Variant
+
+__all__ = ["Base", "Bases"]
+
+
+class Base(NamedTuple):
+    """Tables of a config; why they may not be those of the run, empty where they are; own: whether they are known to
+    be the mission's."""
+
+    tables: Mapping[str, Any]
+    doubt: str = ""
+    own: bool = True
+
+
+class Bases:
+    """The settings of each run of the centre that is followed. given: of a config file, above what is recorded.
+
+    foreign: the hash of `given` where no run had these settings. first: those of the first run. told: in words.
+    """
+
+    def __init__(
+        self, found: Survey, followed: RecordedCentre | None, given: CentreConfig | None, *, by_clock: bool
+    ) -> None:
+        self.remarks: list[str] = []
+        self.foreign = ""
+        self._given = None if given is None else nested(plain_settings(given))
+        self._recorded = {} if followed is None else followed.settings
+        self._doubts: dict[str, str] = {}
+        self.told = "the config given" if given is not None else "its own settings"
+        if followed is None or (by_clock and not self._recorded and given is None):
+            self.first = self._given or {}
+            self.told = self.told if given is not None else "default settings"
+            return
+        if given is not None:
+            assert self._given is not None
+            if config_hash(given) not in followed.hashes:
+                self.foreign = config_hash(given)
+        elif not self._recorded:
+            raise ReviewError(
+                f"{found.path} does not say how its centre was set (version {', '.join(followed.versions)}): "
+                f"give the config of the mission with --config"
+            )
+        else:
+            self._look(found, followed)
+        self.first = self._given or next(iter(self._recorded.values()))
+        others = [version for version in followed.versions if version != __version__]
+        if others:
+            self.remarks.append(f"recorded by version {', '.join(others)}, this is {__version__}: they may differ")
+
+    def _look(self, found: Survey, followed: RecordedCentre) -> None:
+        """Check the recorded settings: they must be usable, and those of their hash."""
+        if followed.unknown:
+            self.remarks.append(f"settings that this version does not know: {', '.join(sorted(followed.unknown))}")
+        for code, tables in self._recorded.items():
+            try:
+                config = centre_config(tables)
+            except ConfigError as error:
+                raise ReviewError(
+                    f"{found.path}: its settings cannot be used by version {__version__} "
+                    f"({'; '.join(error.problems)}): give a config with --config"
+                ) from None
+            if config_hash(config) != code and followed.versions == [__version__]:
+                self._doubts[code] = f"the settings in the log have hash {config_hash(config)}, the log says {code}"
+
+    def check(self, variants: Sequence[Variant]) -> None:
+        """Let every variant be made of every base. `ConfigError` says what cannot be."""
+        for variant in variants:
+            for tables in [self.first, *(() if self._given else self._recorded.values())]:
+                variant.config(tables)
+
+    def of(self, code: str) -> Base:
+        """The settings of a run whose log has this hash."""
+        if self._given is not None:
+            return Base(self._given, own=not self.foreign)
+        if code in self._recorded:
+            doubt = self._doubts.get(code, "")
+            return Base(self._recorded[code], doubt, not doubt)
+        return Base(self.first, "the settings of the run are not in the recording", False)

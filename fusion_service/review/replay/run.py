@@ -1,0 +1,293 @@
+"""A recorded mission fused again: as it was, to the bit, or under other rules and settings, side by side.
+
+The messages of the sources go through the same centre as in the mission, as fast as it can. What a replay makes is
+written by the recorder, beside the mission's own messages, and of origin `replay`. Read as a stream: what is held does
+not grow with the mission.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from threading import Event
+from typing import Any
+
+from fusion_service.centre import StepResult
+from fusion_service.config import config_hash, load_config
+from fusion_service.config.settings import plain_settings
+from fusion_service.errors import ReviewError
+from fusion_service.progress import Progress
+from fusion_service.recording import read
+from fusion_service.recording.steps import Step
+from fusion_service.recording.survey import RecordedCentre, Survey, key_of, survey
+from fusion_service.review.replay.bases import Bases
+from fusion_service.review.replay.following import Clocked, Follower, Player
+from fusion_service.review.replay.variants import variants_of
+from fusion_service.review.replay.verifying import Difference, differences, published_as
+from fusion_service.review.replay.writer import ReplayWriter
+from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, decode
+
+__all__ = ["Replay", "Verdict", "run_replay"]
+
+SHOWN = 200
+"""Messages between two looks of the progress bar."""
+
+
+@dataclass
+class Verdict:
+    """What came of comparing. compared: steps; equal: those without a difference; unseen: those of which only the log
+    is recorded; first: step, its time (ns) and the first difference; largest: relative difference of numbers."""
+
+    compared: int = 0
+    equal: int = 0
+    unseen: int = 0
+    first: tuple[int, int, Difference] | None = None
+    largest: float = 0.0
+
+    def look(self, step: Step, result: StepResult) -> None:
+        """Compare a step that was made with the recorded one."""
+        assert step.log is not None
+        made, recorded = result.tracks, step.picture
+        if recorded is not None and recorded.origin == "replay" and recorded.source != made.source:
+            made = published_as(made, recorded.source)
+        self.compared += 1
+        self.unseen += recorded is None
+        equal = True
+        for one in differences(recorded, made, step.log, result.log):
+            equal = False
+            self.first = self.first or (step.number, step.time, one)
+            self.largest = max(self.largest, 0.0 if math.isnan(one.relative) else one.relative)
+        self.equal += equal
+
+    @property
+    def told(self) -> str:
+        """In a line."""
+        if self.first is None:
+            seen = f", {self.unseen} of them by their log alone" if self.unseen else ""
+            return f"{self.compared} steps made again{seen}: equal to the bit"
+        number, at, one = self.first
+        when = datetime.fromtimestamp(at / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-4] + "Z"
+        whose = f"track {one.track} ({one.track % 2**32}), " if one.track is not None else ""
+        text = f"differs first at step {number} ({when}): {whose}{one.field}: recorded {one.recorded}, made {one.made}"
+        differing = self.compared - self.equal
+        far = f", numbers by {self.largest:.2g} of themselves at most" if self.largest else ""
+        return f"{text}; {differing} of {self.compared} compared steps differ{far}"
+
+
+@dataclass
+class Replay:
+    """What a replay came to. by: log or clock; verdict: None where nothing was to be compared; most_held: messages
+    that were held at a time."""
+
+    path: Path
+    by: str
+    players: list[Player]
+    out: Path | None = None
+    verdict: Verdict | None = None
+    remarks: list[str] = field(default_factory=list)
+    stopped: bool = False
+    most_held: int = 0
+
+    @property
+    def passed(self) -> bool:
+        """Whether something was compared and nothing differed."""
+        return self.verdict is not None and self.verdict.compared > 0 and self.verdict.first is None
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values for a file."""
+        result: dict[str, Any] = {
+            "recording": str(self.path),
+            "out": None if self.out is None else str(self.out),
+            "by": self.by,
+            "stopped": self.stopped,
+            "variants": [_numbers(player) for player in self.players],
+            "remarks": self.remarks,
+        }
+        if self.verdict is not None:
+            first = self.verdict.first
+            result["verify"] = {
+                "passed": self.passed,
+                "compared": self.verdict.compared,
+                "equal": self.verdict.equal,
+                "by_log_alone": self.verdict.unseen,
+                "largest_relative_difference": self.verdict.largest,
+                "first": None if first is None else {"step": first[0], "time": first[1], **_difference(first[2])},
+            }
+        return result
+
+
+def run_replay(
+    path: str | Path,
+    *,
+    rules: Sequence[str] = (),
+    settings: Sequence[str] = (),
+    config: str | Path | None = None,
+    out: str | Path | None = None,
+    verify: bool = False,
+    centre: str | None = None,
+    clock: bool = False,
+    keep_recorded: bool = True,
+    draw: bool = True,
+    stop: Event | None = None,
+    say: Callable[[str], None] = print,
+) -> Replay:
+    """Fuse the recording `path` again; arguments as of the command. Differences that `verify` finds are in the result.
+
+    `ReviewError` or `ConfigError` says what is wrong with what was asked, before anything is written.
+    """
+    if verify and (rules or settings or clock):
+        raise ReviewError("--verify makes the mission as it was: leave out --rule, --set and --clock")
+    stop = stop or Event()
+    given = None if config is None else load_config(config).centre
+    found = survey(path, stop)
+    if stop.is_set():
+        return Replay(found.path, "log", [], stopped=True)
+    followed = found.chosen(centre)
+    if verify and followed is None:
+        raise ReviewError(f"{path} has no step logs of a centre: there is nothing to verify")
+    if not found.inputs:
+        raise ReviewError(f"{path} holds no messages of sources: there is nothing to fuse")
+    players = [Player(one) for one in variants_of(rules, settings, found.sources | set(found.centres))]
+    bases = Bases(found, followed, given, by_clock=clock)
+    bases.check([player.variant for player in players])
+    if verify and bases.foreign:
+        raise ReviewError(f"{config} does not hold the settings of the mission (hash {bases.foreign}): leave it out")
+    by_log = followed is not None and not clock
+    replay = Replay(found.path, "log" if by_log else "clock", players, None if out is None else Path(out))
+    replay.verdict = Verdict() if verify else None
+    with ExitStack() as stack:
+        writer = None
+        if out is not None:
+            writer = stack.enter_context(ReplayWriter(out, found.realm, keep_recorded=keep_recorded, draw=draw))
+        say(_first_line(replay, followed, bases))
+        begin = time.perf_counter()
+        _play(replay, found, followed if by_log else None, bases, writer, stop)
+    replay.remarks += bases.remarks
+    _say_end(replay, time.perf_counter() - begin, say)
+    return replay
+
+
+def _play(
+    replay: Replay,
+    found: Survey,
+    followed: RecordedCentre | None,
+    bases: Bases,
+    writer: ReplayWriter | None,
+    stop: Event,
+) -> None:
+    verdict = replay.verdict
+
+    def on_step(player: Player, result: StepResult, step: Step) -> None:
+        if writer is not None:
+            writer.publish(player.variant.name, result, step.received)
+        if verdict is not None and isinstance(engine, Follower) and not engine.apart:
+            verdict.look(step, result)
+
+    engine: Follower | Clocked
+    if followed is not None:
+        engine = Follower(replay.players, bases.of, on_step)
+    else:
+        configs = [player.variant.config(bases.first) for player in replay.players]
+        engine = Clocked(replay.players, configs, on_step)
+    now, unread = 0, 0
+    with Progress("Fusing") as bar:
+        for number, raw in enumerate(read(found.path)):
+            if stop.is_set():
+                replay.stopped = True
+                break
+            now = max(now, raw.received)
+            if writer is not None:
+                writer.copy(raw)
+            key = key_of(raw.key)
+            if key is None or key.realm != found.realm:
+                continue
+            ours = followed is not None and key.scope == "global" and key.name == followed.name
+            if not (ours and key.what in ("tracks", "log")) and key.scope != "local":
+                continue
+            try:
+                message = decode(raw.data)
+            except MessageError:
+                unread += 1
+                continue
+            if message.source != key.name:
+                continue
+            if isinstance(message, LocalTracks | LocalIntensity | SensorInfo):
+                engine.take(message, raw.received, len(raw.data))
+            elif isinstance(message, StepLog | GlobalTracks) and isinstance(engine, Follower):
+                engine.output(message, raw.received)
+            if isinstance(engine, Follower):
+                engine.advance(raw.received)
+                replay.most_held = max(replay.most_held, engine.held)
+            if number % SHOWN == 0:
+                steps = sum(player.steps for player in replay.players)
+                bar.show(number / max(found.messages, 1), f"{steps} steps")
+    if unread:
+        replay.remarks.append(f"{unread} messages do not decode: they were left out")
+    if isinstance(engine, Clocked):
+        if not replay.stopped:
+            engine.finish(now)
+        replay.remarks += [f"{text} ({count} times)" for text, count in engine.remarks.items()]
+        replay.remarks += [_refusals(player) for player in replay.players if _refusals(player)]
+        return
+    if not replay.stopped:
+        engine.advance(None)
+    if verdict is not None and verdict.first is None:
+        verdict.first = engine.changed
+    replay.remarks += [f"not compared: {one}" for one in engine.left] if verdict is not None else []
+    replay.remarks += [text if count == 1 else f"{text} ({count} times)" for text, count in engine.remarks.items()]
+
+
+def _first_line(replay: Replay, followed: RecordedCentre | None, bases: Bases) -> str:
+    names = ", ".join(player.variant.name for player in replay.players)
+    if replay.by == "log":
+        assert followed is not None
+        what = "verified" if replay.verdict is not None else f"fused again as {names}"
+        how = f"{followed.logs} steps of centre {followed.name}, {what} by their logs"
+    else:
+        why = "--clock" if followed is not None else "no step logs in it"
+        how = f"{why}: fused as {names} by the messages' own time, {bases.told}"
+    return f"{replay.path}: {how}" + (f", into {replay.out}" if replay.out is not None else "")
+
+
+def _say_end(replay: Replay, seconds: float, say: Callable[[str], None]) -> None:
+    for text in replay.remarks:
+        say(text)
+    width = max((len(player.variant.name) for player in replay.players), default=0)
+    for player in replay.players:
+        numbers = _numbers(player)
+        speed = numbers["times_real_time"]
+        fast = "" if not speed else f"   {speed:,.0f} x real time"
+        said = f"{player.steps:>7} steps  {len(player.tracks):>5} tracks  {player.seconds:>8.2f} s of fusion{fast}"
+        say(f"{player.variant.name:<{width}} {said}")
+    span = max((player.span[1] - player.span[0] for player in replay.players), default=0) / 1e9
+    whole = f", {span / seconds:,.0f} x real time with reading and writing" if seconds > 0 and span > 0 else ""
+    say(f"{'stopped' if replay.stopped else 'done'} in {seconds:.1f} s{whole}")
+
+
+def _numbers(player: Player) -> dict[str, Any]:
+    config = player.config
+    span = (player.span[1] - player.span[0]) / 1e9
+    return {
+        "name": player.variant.name,
+        "config": None if config is None else plain_settings(config),
+        "config_hash": None if config is None else config_hash(config),
+        "steps": player.steps,
+        "tracks": len(player.tracks),
+        "seconds": player.seconds,
+        "times_real_time": span / player.seconds if player.seconds > 0 else None,
+    }
+
+
+def _difference(one: Difference) -> dict[str, Any]:
+    return {**one._asdict(), "relative": None if math.isnan(one.relative) else one.relative}
+
+
+def _refusals(player: Player) -> str:
+    refused = player.centre.refusals() if player.centre is not None else {}
+    told = ", ".join(f"{reason} {count}" for reason, count in refused.items())
+    return f"{player.variant.name}: refused {told}" if told else ""

@@ -1,0 +1,1 @@
+"""Searches for weights that are best under a criterion, for many fusions at once."""
