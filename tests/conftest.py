@@ -1,7 +1,8 @@
 from collections.abc import Iterator
 
 import pytest
-from processes import Hub
+
+from tests.helpers.processes import Hub
 
 
 @pytest.fixture(scope="session")

@@ -13,13 +13,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Hub
 
 from fusion_service import cli, demo
 from fusion_service.config import centre_config, load_config
 from fusion_service.recording import default_path
 from sensor_clients import cli as client_cli
 from sensor_clients.scenarios.three_radars import three_radars
+from tests.helpers.processes import Hub
 
 ROOT = Path(__file__).parents[1]
 DOCKER = ROOT / "docker"

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import xlogy
 from scipy.stats import binom, poisson
-from strategies import seeds
 
 from fusion_service.existence import (
     ExistenceError,
@@ -26,6 +25,7 @@ from fusion_service.existence import (
     loss_threshold,
     lower_existence,
 )
+from tests.helpers.strategies import seeds
 
 Array = NDArray[np.float64]
 probabilities = st.floats(0.0, 1.0)

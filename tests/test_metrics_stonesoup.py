@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from missions import picture, truth
 from numpy.typing import NDArray
 
 from fusion_service.metrics import gospa, ospa
 from fusion_service.review.evaluation import Evaluation, evaluate
 from schemas import Message
+from tests.helpers.missions import picture, truth
 
 pytest.importorskip("stonesoup", reason="the extra oracle")
 

@@ -6,7 +6,8 @@ import signal
 import time
 
 import pytest
-from processes import Program
+
+from tests.helpers.processes import Program
 
 SLOW_IMPORT = """
 import sys

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import SIGMA, SPACE, centre, give, info, moved, seen, step, tracks, truth
 
 import schemas
 from fusion_service.centre import FusionCentre, Order, SourceFound, SourceLost, StepResult
 from fusion_service.centre.checkpoint import CheckpointError
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
+from tests.centre.worlds import SIGMA, SPACE, centre, give, info, moved, seen, step, tracks, truth
 
 SOURCES = ("r1", "r2", "r3")
 

@@ -8,10 +8,10 @@ from time import process_time
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import SECOND, START
 
 from fusion_service.centre import MessageClock, WallClock
 from fusion_service.config import CentreConfig
+from tests.centre.worlds import SECOND, START
 
 
 def clock(**config: float) -> MessageClock:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-import fuse_again
 import numpy as np
 import pytest
-from worlds import SECOND, START, info, moved, seen, tracks, truth
 
 import schemas
 from fusion_service.centre import FusionCentre, Order, SourceFound, SourceLost
 from fusion_service.config import CentreConfig, centre_config
+from tests.centre.worlds import SECOND, START, info, moved, seen, tracks, truth
+from tests.helpers import fuse_again
 
 
 @pytest.mark.parametrize("memory", ["restart", "recursive"])

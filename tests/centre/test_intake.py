@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from worlds import FRAME, SECOND, SPACE, START, centre, give, info, moved, step, tracks, truth
 
 import schemas
 from fusion_service.centre import FusionCentre, Refused, SourceFound
+from tests.centre.worlds import FRAME, SECOND, SPACE, START, centre, give, info, moved, step, tracks, truth
 
 SOURCES = ("r1", "r2", "r3")
 

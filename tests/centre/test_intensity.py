@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
-import fuse_again
 import numpy as np
 import pytest
-from worlds import FRAME, SECOND, SPACE, START, give, info, moved, step, tracks, truth
 
 import schemas
 from fusion_service.centre import FusionCentre, IntensityCentre, Order, StepResult
@@ -19,6 +17,8 @@ from fusion_service.metrics import gospa
 from schemas import Disk
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 from sensor_clients.scenarios import three_radars as world
+from tests.centre.worlds import FRAME, SECOND, SPACE, START, give, info, moved, step, tracks, truth
+from tests.helpers import fuse_again
 
 SIGMA = np.array([30.0, 30.0, 2.0, 2.0])
 STATES = np.array([[0.0, 0, 10, 0], [5000.0, 0, 0, 10], [0.0, 8000, -5, 5]])

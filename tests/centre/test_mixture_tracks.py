@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from worlds import SPACE, centre, give, moved, step, tracks, truth
 
 import schemas
 from fusion_service.centre import FusionCentre
 from fusion_service.densities import Mixture
 from fusion_service.rules import fuse, fuse_mixtures
+from tests.centre.worlds import SPACE, centre, give, moved, step, tracks, truth
 
 SOURCES = ("r1", "r2")
 

@@ -3,9 +3,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from recording.mission import Sent, mission
 
 from fusion_service.recording import Recorder
+from tests.recording.mission import Sent, mission
 
 
 @pytest.fixture(scope="session")

@@ -7,17 +7,17 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import missions
 import numpy as np
 import pytest
-from recording.contents import entities, key_of, record, row, rows, texts
-from recording.mission import RADARS, SIGMA, START, TARGETS, Sent, mission, positions
 from scipy.stats import binomtest, chi2
 
 from fusion_service.recording import Recorder
 from fusion_service.recording.columns import Stamp
 from fusion_service.recording.drawing.errors import Assessment, Score
 from schemas import Message, encode, global_key, local_key
+from tests.helpers import missions
+from tests.recording.contents import entities, key_of, record, row, rows, texts
+from tests.recording.mission import RADARS, SIGMA, START, TARGETS, Sent, mission, positions
 
 SECOND = 10**9
 

@@ -7,15 +7,15 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import missions
 import numpy as np
 import pytest
-from recording.contents import FIRST, entities, key_of, opacities, record, row, rows, static
-from recording.mission import START, Sent
 from scipy.stats import chi2
 
 from fusion_service.recording import Recorder, read
 from schemas import LocalIntensity, LocalTracks, Message, encode
+from tests.helpers import missions
+from tests.recording.contents import FIRST, entities, key_of, opacities, record, row, rows, static
+from tests.recording.mission import START, Sent
 
 WEIGHTS = np.array([0.6, 0.3, 0.1, 1.0])
 PLACES = [(0.0, 0.0), (30.0, 10.0), (-20.0, 50.0), (500.0, 0.0)]

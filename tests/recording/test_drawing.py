@@ -6,18 +6,18 @@ import math
 from pathlib import Path
 from typing import Any
 
-import missions
 import numpy as np
 import pymap3d
 import pytest
-from recording.contents import opacities, record, row, rows, texts
-from recording.mission import LOST, RADARS, START, TARGETS, Sent
 from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from fusion_service.recording import read
 from fusion_service.recording.drawing.geometry import moments
 from schemas import Ecef, Enu, Local, Message, Polygon, encode, global_key, local_key
+from tests.helpers import missions
+from tests.recording.contents import opacities, record, row, rows, texts
+from tests.recording.mission import LOST, RADARS, START, TARGETS, Sent
 
 SECOND = 10**9
 

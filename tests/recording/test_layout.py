@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from recording.contents import entities, key_of, row, rows, static, texts
-from recording.mission import GENERATION, RADARS, START, Sent, mission, positions
 from rerun.chunk import RrdReader
 
 from fusion_service.recording import Recorder
@@ -17,6 +15,8 @@ from fusion_service.recording.drawing import palette
 from fusion_service.recording.drawing.geometry import Chart, rings
 from schemas import Enu, GlobalTracks, Message, StepLog, encode, global_key, local_key
 from schemas.messages import BROKEN, KEPT, LINKED, MERGED, NO_SOURCE
+from tests.recording.contents import entities, key_of, row, rows, static, texts
+from tests.recording.mission import GENERATION, RADARS, START, Sent, mission, positions
 
 SECOND = 10**9
 

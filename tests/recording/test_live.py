@@ -12,12 +12,8 @@ import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
 
-import missions
 import numpy as np
 import pytest
-from processes import Hub, Program, eventually, free_endpoint
-from recording.contents import FIRST, entities, key_of
-from recording.mission import mission
 from rerun.chunk import RrdReader
 
 from fusion_service.cli import main
@@ -26,6 +22,10 @@ from fusion_service.recording import live as module
 from fusion_service.recording.live import Live, address
 from fusion_service.recording.program import find_program, quiet
 from schemas import encode
+from tests.helpers import missions
+from tests.helpers.processes import Hub, Program, eventually, free_endpoint
+from tests.recording.contents import FIRST, entities, key_of
+from tests.recording.mission import mission
 
 HOST = "127.0.0.1"
 

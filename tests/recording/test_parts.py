@@ -10,9 +10,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from processes import Hub, Program, eventually
-from recording.contents import entities, rows, static
-from recording.mission import RADARS, Sent, mission
 from rerun.chunk import RrdReader
 
 from fusion_service.bus import open_bus
@@ -24,6 +21,9 @@ from fusion_service.recording.parts import DEFAULT_SIZE, Folder, is_folder
 from fusion_service.recording.reader import recording_id
 from fusion_service.recording.repair import mend
 from schemas import decode, local_key
+from tests.helpers.processes import Hub, Program, eventually
+from tests.recording.contents import entities, rows, static
+from tests.recording.mission import RADARS, Sent, mission
 
 INFOS = [local_key(name, "info") for name in RADARS]
 
@@ -348,7 +348,7 @@ LOAD = """
 import os, signal, sys, time
 sys.path.insert(0, sys.argv[3])
 from fusion_service.bus import open_bus
-from recording.mission import mission
+from tests.recording.mission import mission
 count = int(sys.argv[2])
 with open_bus([sys.argv[1]], wait=10) as bus:
     said = [sent for sent in mission(count)]
@@ -374,7 +374,7 @@ def test_the_process_loses_nothing_when_it_rotates_under_load_and_is_killed(hub:
     said = list(mission(150))
     with (
         Program(run) as recorder,
-        Program(LOAD, hub.endpoint, "150", str(Path(__file__).parents[1])) as load,
+        Program(LOAD, hub.endpoint, "150", str(Path(__file__).parents[2])) as load,
     ):
         assert load.line(20) == "ready"
         eventually(lambda: folder.is_dir() and parts(folder), 20)

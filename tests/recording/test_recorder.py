@@ -12,17 +12,17 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
-import missions
 import numpy as np
 import pytest
-from processes import Hub, Program
-from recording.contents import entities, key_of, record, rows, texts
-from recording.mission import START, Sent, mission
 from rerun.chunk import RrdReader
 
 from fusion_service.bus import Bus, open_bus
 from fusion_service.recording import RawMessage, Recorder, default_path, messages, read, repair, run_recorder
 from schemas import Message, encode, local_key
+from tests.helpers import missions
+from tests.helpers.processes import Hub, Program
+from tests.recording.contents import entities, key_of, record, rows, texts
+from tests.recording.mission import START, Sent, mission
 
 SECOND = 10**9
 
@@ -138,7 +138,7 @@ def test_a_torn_recording_opens_once_it_is_repaired(flown: tuple[Path, list[Sent
 FILL = """
 import os, resource, sys
 sys.path.insert(0, sys.argv[2])
-from recording.mission import mission
+from tests.recording.mission import mission
 from fusion_service.recording import Recorder, recorder as module
 module.FLUSH = 1.0
 resource.setrlimit(resource.RLIMIT_FSIZE, (200_000, 200_000))
@@ -151,7 +151,7 @@ with Recorder(sys.argv[1]) as recorder:
 
 def test_a_disk_that_fails_ends_the_recorder_with_an_error_and_keeps_what_is_on_it(tmp_path: Path) -> None:
     path = tmp_path / "a.rrd"
-    with Program(FILL, str(path), str(Path(__file__).parents[1])) as program:
+    with Program(FILL, str(path), str(Path(__file__).parents[2])) as program:
         code, errors = program.end(30)
     assert code == 1
     assert f"OSError: cannot write to {path} any more" in errors

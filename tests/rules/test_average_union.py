@@ -7,10 +7,10 @@ import pytest
 from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
-from strategies import sources
-from test_intersection import gains_of, worst_ratio
 
 from fusion_service.rules import RuleError, fuse
+from tests.helpers.strategies import sources
+from tests.rules.test_intersection import gains_of, worst_ratio
 
 Array = NDArray[np.float64]
 SEED = 2009

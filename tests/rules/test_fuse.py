@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from strategies import sources
 
 from fusion_service.rules import RULES, RuleError, fuse, fuse_last
+from tests.helpers.strategies import sources
 
 Array = NDArray[np.float64]
 SEED = 31

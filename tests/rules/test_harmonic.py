@@ -6,9 +6,9 @@ from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import multivariate_normal
-from strategies import sources
 
 from fusion_service.rules import fuse
+from tests.helpers.strategies import sources
 
 Array = NDArray[np.float64]
 SEED = 99

@@ -9,9 +9,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import sqrtm
 from scipy.optimize import minimize, minimize_scalar
-from strategies import covariance, sources
 
 from fusion_service.rules import fuse
+from tests.helpers.strategies import covariance, sources
 
 Array = NDArray[np.float64]
 SEED = 4711

@@ -10,11 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import chi2, multivariate_normal
-from strategies import covariance, dimensions, seeds
 
 from fusion_service.densities import Mixture, Mixtures
 from fusion_service.rules import RuleError, fuse
 from fusion_service.rules.mixtures import MIXTURE_RULES, fuse_mixtures, fuse_mixtures_last
+from tests.helpers.strategies import covariance, dimensions, seeds
 
 Array = NDArray[np.float64]
 A, B = np.array([[2.5, -1.0], [-1.0, 1.2]]), np.array([[0.8, -0.5], [-0.5, 4.0]])

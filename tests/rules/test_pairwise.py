@@ -8,9 +8,9 @@ import pytest
 from numpy.typing import NDArray
 from scipy.linalg import eigh, sqrtm
 from scipy.optimize import minimize, minimize_scalar
-from strategies import covariance, sources
 
 from fusion_service.rules import RuleError, fuse, fuse_last
+from tests.helpers.strategies import covariance, sources
 
 Array = NDArray[np.float64]
 SEED = 2017

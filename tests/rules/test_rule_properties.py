@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from strategies import estimates, seeds
 
 from fusion_service.rules import fuse
+from tests.helpers.strategies import estimates, seeds
 
 Array = NDArray[np.float64]
 Estimates = tuple[Array, Array]

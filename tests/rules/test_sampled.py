@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
-from strategies import sources
 
 from fusion_service.rules import fuse
+from tests.helpers.strategies import sources
 
 Array = NDArray[np.float64]
 SEED = 74

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import msgpack
-from make_vectors import VECTORS
+
+from tests.schemas.make_vectors import VECTORS
 
 GOLDEN = {path.stem: path.read_bytes() for path in sorted(VECTORS.glob("*.msgpack"))}
 

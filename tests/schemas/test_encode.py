@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from golden import GOLDEN, changed
 
 import schemas
+from tests.schemas.golden import GOLDEN, changed
 
 
 def local(name: str = "local_tracks_full") -> schemas.LocalTracks:

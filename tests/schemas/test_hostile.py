@@ -12,13 +12,13 @@ from typing import Any
 
 import msgpack
 import pytest
-from golden import GOLDEN, changed
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from make_vectors import VECTORS, message_forms, page
 
 import schemas
 from schemas.codec import MAX_ITEMS
+from tests.schemas.golden import GOLDEN, changed
+from tests.schemas.make_vectors import VECTORS, message_forms, page
 
 PAGE = page()
 ONE_OF_EACH = (

@@ -12,9 +12,9 @@ from typing import Any
 import msgpack
 import numpy as np
 import pytest
-from make_vectors import VECTORS, message_forms, page
 
 import schemas
+from tests.schemas.make_vectors import VECTORS, message_forms, page
 
 NAMES = sorted(path.stem for path in VECTORS.glob("*.json"))
 ATTRIBUTES = {"covs": "covariances"}

@@ -9,13 +9,13 @@ import re
 import msgpack
 import numpy as np
 import pytest
-from make_vectors import VECTORS, dump, forms, message_forms, pack, page, sections
 
 import schemas
 from schemas.codec import MAX_ITEMS
 from schemas.messages import NO_SOURCE
 from schemas.tables import CLASSES, FIELDS
 from schemas.values import pack_column, pack_covariances
+from tests.schemas.make_vectors import VECTORS, dump, forms, message_forms, pack, page, sections
 
 PAGE = page()
 SECTIONS = sections(PAGE)

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pymap3d
 import pytest
-from missions import FRAME, START, at, info, picture, tracks, truth
 
 from fusion_service.metrics import gospa, ospa
 from fusion_service.review.evaluation import METRICS, evaluate, format_table
 from schemas import Disk, Ecef, Enu, Local, Message, Truth
+from tests.helpers.missions import FRAME, START, at, info, picture, tracks, truth
 
 SEED = 20250705
 STILL = [[0.0, 0.0]]

@@ -9,11 +9,11 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import numpy as np
-from processes import Hub, Program
 
 import schemas
 from fusion_service.bus import Bus, open_bus
 from schemas.messages import BORN, CONFIRMED, GlobalTracks, Status, StepLog
+from tests.helpers.processes import Hub, Program
 
 COMMAND = "import sys\nfrom fusion_service.cli import main\nraise SystemExit(main(sys.argv[1:]))"
 

@@ -9,12 +9,12 @@ import time
 from collections.abc import Iterator
 
 import pytest
-from processes import Hub, Program, eventually, free_endpoint
 
 from fusion_service.bus import Bus, BusError, BusStopped, Inbox, open_bus
 from fusion_service.bus.hub import run_hub
 from fusion_service.bus.session import HANDSHAKE
 from schemas import MAX_BYTES
+from tests.helpers.processes import Hub, Program, eventually, free_endpoint
 
 SUBSCRIBER = """
 import os, sys

@@ -9,12 +9,12 @@ from signal import SIGTERM
 from typing import Any
 
 import numpy as np
-from centre.worlds import SECOND, START, info, moved, seen, tracks, truth
 
 import schemas
 from fusion_service.centre import FusionCentre, IntensityCentre, Order, SourceFound, SourceLost, StepResult
 from fusion_service.config import centre_config
 from fusion_service.recording import RawMessage, Recorder, read
+from tests.centre.worlds import SECOND, START, info, moved, seen, tracks, truth
 
 SOURCES = ("r1", "r2", "r3")
 REALM = "sea"

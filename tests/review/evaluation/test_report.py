@@ -8,7 +8,6 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from recording.mission import mission
 
 from fusion_service.review.evaluation import Assessment, assess
 from fusion_service.review.evaluation.logbook import Logbook
@@ -16,6 +15,7 @@ from fusion_service.review.evaluation.report import report
 from fusion_service.review.evaluation.report_text import WORDS
 from fusion_service.review.evaluation.tables import digits
 from schemas import GlobalTracks, Message, Truth
+from tests.recording.mission import mission
 
 STEPS = 40
 VOID = {"meta", "img", "br"}

@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from centre.worlds import FRAME, SECOND, SPACE, START, info, tracks
-from flown import Flight, places, raws
 from scipy.stats import chi2
 
 import schemas
@@ -20,6 +18,8 @@ from fusion_service.errors import ReviewError
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.review.explain import explanation, listing, read_mission
 from schemas import GlobalTracks, LocalTracks, StepLog, Truth
+from tests.centre.worlds import FRAME, SECOND, SPACE, START, info, tracks
+from tests.helpers.flown import Flight, places, raws
 
 GATE, KEEP = (f"{chi2.ppf(p, 4):.1f}" for p in (0.999, 0.9999))
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from processes import Hub, Program, eventually
 from scipy.stats import multivariate_normal
 
 import schemas
@@ -16,6 +15,7 @@ from sensor_clients.filters import GmPhdFilter, PhdConfig, Position
 from sensor_clients.filters.gmphd import merge
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.scenarios import three_radars as world
+from tests.helpers.processes import Hub, Program, eventually
 
 SECOND = 10**9
 SIGMA, SPEED = 5.0, 6.0

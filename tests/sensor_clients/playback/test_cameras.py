@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from processes import Hub, Program, eventually
 
 import schemas
 from fusion_service import densities
@@ -21,6 +20,7 @@ from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback import autoferry
 from sensor_clients.playback.cameras import EO, IR, CameraSensor, CameraTracker
 from sensor_clients.playback.harbour import ClutterMap
+from tests.helpers.processes import Hub, Program, eventually
 
 SECOND = 10**9
 CAMERAS = {"ir": IR, "eo": EO}

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from worlds import FRAME, SIGMA, centre, give, info, moved, step, tracks, truth
 
 import schemas
 from fusion_service.centre import FusionCentre
 from schemas.messages import CONFIRMED, TENTATIVE
+from tests.centre.worlds import FRAME, SIGMA, centre, give, info, moved, step, tracks, truth
 
 SPOT = [[0.0, 0.0, 0.0, 0.0]]
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import msgpack
 import numpy as np
 import pytest
-from processes import Hub, eventually
-from scene import Scene, opened
 
 import schemas
 from fusion_service.bus import BusError
+from tests.helpers.processes import Hub, eventually
+from tests.helpers.scene import Scene, opened
 
 
 @pytest.fixture

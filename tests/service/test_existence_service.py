@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from processes import Hub, eventually
-from scene import opened
+
+from tests.helpers.processes import Hub, eventually
+from tests.helpers.scene import opened
 
 # argv: endpoint, name, sigma along x, sigma along y
 WITNESS = """

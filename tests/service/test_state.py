@@ -7,10 +7,10 @@ import re
 from pathlib import Path
 
 import pytest
-from processes import Program
 
 from fusion_service.service import state as state_module
 from fusion_service.service.state import StateError, open_state
+from tests.helpers.processes import Program
 
 TAKER = """
 import sys

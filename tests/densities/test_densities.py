@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.stats import multivariate_normal, norm
-from strategies import covariance, dimensions, seeds
 
 from fusion_service.densities import (
     DensityError,
@@ -21,6 +20,7 @@ from fusion_service.densities import (
     reduce_mixtures,
     sampled_moments,
 )
+from tests.helpers.strategies import covariance, dimensions, seeds
 
 Array = NDArray[np.float64]
 

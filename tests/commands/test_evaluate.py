@@ -13,8 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from missions import info, picture, tracks
-from recording.mission import START, Sent, mission
 
 from fusion_service.cli import main
 from fusion_service.commands import evaluate as command
@@ -23,6 +21,8 @@ from fusion_service.review.evaluation import assess, evaluate
 from fusion_service.review.evaluation.logbook import Logbook
 from fusion_service.review.export import export
 from schemas import Entry, GlobalTracks, StepLog, Truth, digest, global_key
+from tests.helpers.missions import info, picture, tracks
+from tests.recording.mission import START, Sent, mission
 
 CUTOFF, STEPS = 500.0, 100
 SECOND = 10**9

@@ -11,13 +11,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from missions import FRAME, info, picture, tracks, truth
 from numpy.typing import NDArray
 
 from fusion_service.colours import FUSED, SOURCES, TRUTH, source_colours
 from fusion_service.geodesy import enu_to_geodetic, geodetic_to_ecef
 from fusion_service.review.mission_map import mission_map
 from schemas import Disk, Ecef, Enu, Local, Message, Polygon, Sector
+from tests.helpers.missions import FRAME, info, picture, tracks, truth
 
 image = pytest.importorskip("matplotlib.image")
 Pixels = NDArray[np.float64]

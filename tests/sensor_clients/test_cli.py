@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
-from processes import Hub, Program, eventually, free_endpoint
 
 from fusion_service.bus import open_bus
 from schemas import LocalTracks, Message, SensorInfo, Truth, decode
@@ -20,6 +19,7 @@ from sensor_clients.events import Event
 from sensor_clients.publisher import TrackPublisher
 from sensor_clients.runner import pace
 from sensor_clients.scenarios import three_radars as world
+from tests.helpers.processes import Hub, Program, eventually, free_endpoint
 
 MAIN = "import sys; from sensor_clients.cli import main; sys.exit(main(sys.argv[1:]))"
 

@@ -9,14 +9,8 @@ import threading
 from pathlib import Path
 from typing import Any
 
-import flown
 import numpy as np
 import pytest
-from centre.worlds import FRAME, SECOND, SPACE, START, info, moved, seen, tracks, truth
-from flown import REALM, Flight, edited, messy, raws, record
-from processes import Hub, eventually
-from recording.contents import entities
-from scene import COMMAND, Program, opened
 
 import schemas
 from fusion_service.cli import main
@@ -26,6 +20,12 @@ from fusion_service.errors import ReviewError
 from fusion_service.review.replay import Replay, run_replay
 from fusion_service.rules import RULES
 from schemas import GlobalTracks, LocalTracks, StepLog
+from tests.centre.worlds import FRAME, SECOND, SPACE, START, info, moved, seen, tracks, truth
+from tests.helpers import flown
+from tests.helpers.flown import REALM, Flight, edited, messy, raws, record
+from tests.helpers.processes import Hub, eventually
+from tests.helpers.scene import COMMAND, Program, opened
+from tests.recording.contents import entities
 
 OPTIONS: dict[str, dict[str, Any]] = {
     "hmd-s": {"samples": 200},

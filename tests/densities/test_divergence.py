@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import binom
-from strategies import dimensions, seeds, sources
 
 from fusion_service.densities import (
     Mixture,
@@ -20,6 +19,7 @@ from fusion_service.densities import (
     kl_gaussians,
     overlap_gaussians,
 )
+from tests.helpers.strategies import dimensions, seeds, sources
 
 Array = NDArray[np.float64]
 GRID = np.linspace(-25.0, 25.0, 20_001)

@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import Hub, Program, eventually, free_endpoint
-from scene import COMMAND, CONFIG, SENSOR, Observer, Scene, opened
 
 import schemas
 from fusion_service.bus import open_bus
 from schemas.messages import GlobalTracks
+from tests.helpers.processes import Hub, Program, eventually, free_endpoint
+from tests.helpers.scene import COMMAND, CONFIG, SENSOR, Observer, Scene, opened
 
 
 @pytest.fixture

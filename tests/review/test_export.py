@@ -8,8 +8,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from missions import START, info, picture, tracks, truth
-from processes import Hub, Program, eventually
 
 import schemas
 from fusion_service import geodesy
@@ -21,6 +19,8 @@ from fusion_service.review.export import export
 from schemas import Enu, GlobalTracks, Height, LocalTracks, Message, Truth
 from schemas.flat import frame_of, frame_text, space_of, track_columns
 from sensor_clients.playback import table
+from tests.helpers.missions import START, info, picture, tracks, truth
+from tests.helpers.processes import Hub, Program, eventually
 
 CLIENT = "import sys; from sensor_clients.cli import main; sys.exit(main(sys.argv[1:]))"
 SPACE = ("x", "vx", "y", "vy")

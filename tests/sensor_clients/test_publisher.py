@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from processes import Hub, Program, eventually
 
 from fusion_service.bus import Bus, BusError, open_bus
 from schemas import (
@@ -26,6 +25,7 @@ from schemas import (
     decode,
 )
 from sensor_clients.publisher import TrackPublisher, TruthPublisher
+from tests.helpers.processes import Hub, Program, eventually
 
 SITE = Enu(59.3, 10.4)
 SPACE = ("x", "vx", "y", "vy")

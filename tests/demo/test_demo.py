@@ -11,9 +11,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-import fuse_again
 import pytest
-from processes import Program, eventually
 
 from fusion_service import demo
 from fusion_service.cli import main
@@ -21,6 +19,8 @@ from fusion_service.config import ConfigError, load_config
 from fusion_service.demo import DemoError, run_demo
 from fusion_service.recording import messages
 from schemas import Enu, GlobalTracks, StepLog, Truth
+from tests.helpers import fuse_again
+from tests.helpers.processes import Program, eventually
 
 COMMAND = "import sys\nfrom fusion_service.cli import main\nraise SystemExit(main(sys.argv[1:]))"
 PARTS = {

@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from processes import Hub, eventually
-from scene import Scene, opened
+
+from tests.helpers.processes import Hub, eventually
+from tests.helpers.scene import Scene, opened
 
 # A sensor that expects the targets k at (1000 k, 0) as one component each, and sees places with x below `reach` m.
 SENSOR = """
