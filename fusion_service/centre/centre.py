@@ -28,8 +28,7 @@ from fusion_service.centre.publishing import Contributions, picture_message
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.status import step_status
 from fusion_service.config import CentreConfig, centre_config, config_hash
-from schemas import GlobalTracks, Status, StepLog
-from schemas import messages as words
+from schemas import GlobalTracks, Status, StepLog, messages
 
 __all__ = ["Centre", "StepResult"]
 
@@ -174,4 +173,4 @@ class Centre(ABC):
 
     def _numbers(self) -> dict[str, int]:
         kinds = Counter(self._picture.status.tolist())
-        return {name: kinds.get(code, 0) for code, name in enumerate(words.STATUSES)}
+        return {name: kinds.get(code, 0) for code, name in enumerate(messages.STATUSES)}

@@ -18,7 +18,7 @@ class Ids:
         """Go on with the ids of a generation that was never used."""
         self.next = (generation << 32) + 1
 
-    def take(self, count: int) -> NDArray[np.uint64]:
+    def allot(self, count: int) -> NDArray[np.uint64]:
         """So many new ids."""
         first, self.next = self.next, self.next + count
         return np.arange(first, self.next, dtype=np.uint64)

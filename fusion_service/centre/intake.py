@@ -186,7 +186,7 @@ class Intake:
         for order in orders:
             self._order(order, journal)
         self._present, self._refused = {}, Counter()
-        self._take(self._due(time, journal), time, last, journal)
+        self._accept(self._due(time, journal), time, last, journal)
         return orders
 
     def _due(self, time: int, journal: Journal) -> list[_Keyed]:
@@ -249,7 +249,7 @@ class Intake:
         self.sources[name] = self._new(name)
         return self.sources[name]
 
-    def _take(self, messages: list[_Keyed], time: int, last: int, journal: Journal) -> None:
+    def _accept(self, messages: list[_Keyed], time: int, last: int, journal: Journal) -> None:
         tracks: list[tuple[Source, _Scan, Entry]] = []
         for (name, epoch, seq, kind, code, received), message in messages:
             entry = Entry(name, epoch, seq, code)
@@ -268,7 +268,7 @@ class Intake:
                 source.begin(epoch)
             source.note(kind, seq, code)
             source.origin = message.origin
-            journal.take(entry)
+            journal.accept(entry)
             if isinstance(message, SensorInfo):
                 if source.info is None or seq > source.info.seq:
                     source.info = message

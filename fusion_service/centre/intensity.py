@@ -146,7 +146,7 @@ class IntensityCentre(Centre):
         if len(free) > room:
             self._journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(free) - room))
             free = free[:room]
-        ids = self._ids.take(len(free))
+        ids = self._ids.allot(len(free))
         self._journal.birth(ids)
         track[free] = count + np.arange(len(free))
         picture = replace(picture, mean=mean, covariance=covariance, existence=np.minimum(picture.existence, nearby))

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.config.settings import recordable
-from schemas import Decisions, Entry, StepLog
-from schemas import messages as words
+from schemas import Decisions, Entry, StepLog, messages
 
 if TYPE_CHECKING:
     from fusion_service.centre.rows import Rows
@@ -70,7 +69,7 @@ class Journal:
         if len(self._events) < MOST_ENTRIES:
             self._events.append(event)
 
-    def take(self, entry: Entry) -> None:
+    def accept(self, entry: Entry) -> None:
         """A message used in this step."""
         self._taken.append(entry)
 
@@ -96,7 +95,7 @@ class Journal:
 
     def broke(self, rows: Rows, at: NDArray[np.intp], tracks: NDArray[np.uint64], value: NDArray[np.float64]) -> None:
         """The links of the local tracks `at` to the global ids `tracks` are broken."""
-        self.decide(words.BROKEN, rows, at, tracks, value)
+        self.decide(messages.BROKEN, rows, at, tracks, value)
         self.broken = dict(zip(at.tolist(), tracks.tolist(), strict=True))
 
     def tracks(self, kind: int, tracks: NDArray[np.uint64], other: NDArray[np.uint64] | None = None) -> None:
@@ -111,21 +110,21 @@ class Journal:
 
     def birth(self, ids: NDArray[np.uint64]) -> None:
         """New global tracks."""
-        self.tracks(words.BORN, ids)
+        self.tracks(messages.BORN, ids)
 
     def merge(self, old: int, new: int, distance: float) -> None:
         """`new` goes on as `old`."""
-        self._column(words.MERGED, *(np.array([value]) for value in (new, NO_SOURCE, 0, 0, old, distance)))
+        self._column(messages.MERGED, *(np.array([value]) for value in (new, NO_SOURCE, 0, 0, old, distance)))
         self._ended.append((new, "merged", old))
 
     def split(self, new: int, old: int) -> None:
         """`new` was part of `old`."""
-        self.tracks(words.SPLIT, np.array([new], dtype=np.uint64), np.array([old], dtype=np.uint64))
+        self.tracks(messages.SPLIT, np.array([new], dtype=np.uint64), np.array([old], dtype=np.uint64))
         self._splits.append((new, old))
 
     def end(self, track: int, reason: str, replaced_by: int | None) -> None:
         """A global track is no more."""
-        self.tracks(words.DELETED, np.array([track], dtype=np.uint64))
+        self.tracks(messages.DELETED, np.array([track], dtype=np.uint64))
         self._ended.append((track, reason, replaced_by))
 
     def ended(self) -> tuple[tuple[int, str, int | None], ...]:

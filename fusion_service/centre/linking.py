@@ -23,8 +23,7 @@ from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
-from schemas import Entry
-from schemas import messages as words
+from schemas import Entry, messages
 
 __all__ = ["Linker"]
 
@@ -61,7 +60,7 @@ class Linker:
         distance = leave_one_out(links, tracks.mean[:, linked], tracks.covariance[:, :, linked])
         failed = distance > self._keep_gate
         tracks.fails[linked] = np.where(failed, tracks.fails[linked] + 1, 0)
-        journal.decide(words.GATE_FAILED, rows, linked[failed], links[failed], distance[failed])
+        journal.decide(messages.GATE_FAILED, rows, linked[failed], links[failed], distance[failed])
         ripe = np.flatnonzero(tracks.fails[linked] >= self.config.break_after)
         if len(ripe):
             # of one global track only the worst leaves at a time: farthest, then youngest, then last in order
@@ -72,7 +71,7 @@ class Linker:
             tracks.link[linked[worst]] = NO_TRACK
             tracks.fails[linked] = np.where(np.isin(links, links[worst]), 0, tracks.fails[linked])
         stays = (tracks.link[linked] != NO_TRACK) & ~failed
-        journal.decide(words.KEPT, rows, linked[stays], links[stays], distance[stays])
+        journal.decide(messages.KEPT, rows, linked[stays], links[stays], distance[stays])
 
     def link(
         self, rows: Rows, picture: Picture, now: Picture, step: int, time: int, journal: Journal
@@ -162,7 +161,7 @@ class Linker:
         if len(starting) > room:
             journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(starting) - room))
             starting = starting[:room]
-        new_ids = self._ids.take(len(starting))
+        new_ids = self._ids.allot(len(starting))
         ids = np.zeros(len(root), dtype=np.uint64)
         ids[:count] = picture.id[known]
         ids[starting] = new_ids
@@ -172,7 +171,7 @@ class Linker:
         tracks.since[free[takes]] = step
         tracks.fails[free[takes]] = 0
         tracks.used[free[takes]] = -1
-        journal.decide(words.LINKED, rows, free[takes], given[takes], distance[takes])
+        journal.decide(messages.LINKED, rows, free[takes], given[takes], distance[takes])
         journal.birth(new_ids)
         born = set(new_ids.tolist())
         for row, old in journal.broken.items():

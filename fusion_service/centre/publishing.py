@@ -13,8 +13,7 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture, advance
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
-from schemas import ORIGINS, GlobalTracks, Local
-from schemas import messages as words
+from schemas import ORIGINS, GlobalTracks, Local, messages
 
 __all__ = ["Contributions", "live_on", "picture_message"]
 
@@ -44,7 +43,7 @@ def live_on(
     picture, ended = advance(picture, time, support, fresh, config)
     for track in picture.id[ended].tolist():
         journal.end(track, "lost", None)
-    for status, decision in ((words.CONFIRMED, words.CONFIRMED_NOW), (words.COASTING, words.COASTING_NOW)):
+    for status, decision in ((messages.CONFIRMED, messages.CONFIRMED_NOW), (messages.COASTING, messages.COASTING_NOW)):
         journal.tracks(decision, picture.id[(picture.status == status) & (before != status) & ~ended])
     return picture, ended
 
