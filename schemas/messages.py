@@ -25,6 +25,7 @@ __all__ = [
     "CONFIRMED_NOW",
     "DECISIONS",
     "DELETED",
+    "EXCHANGED",
     "GATE_FAILED",
     "KEPT",
     "LINKED",
@@ -68,8 +69,9 @@ DECISIONS = (
     "confirmed",
     "coasting",
     "deleted",
+    "exchanged",
 )
-LINKED, KEPT, BROKEN, GATE_FAILED, MERGED, SPLIT, BORN, CONFIRMED_NOW, COASTING_NOW, DELETED = range(10)
+LINKED, KEPT, BROKEN, GATE_FAILED, MERGED, SPLIT, BORN, CONFIRMED_NOW, COASTING_NOW, DELETED, EXCHANGED = range(11)
 NO_SOURCE = 65535
 """The `source` of a decision that concerns no local track."""
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
 _PLAIN = (
     *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
     *("origin", "waited", "highest", "first"),
@@ -64,13 +64,13 @@ def unpack_state(blob: bytes, intake: Intake, space: tuple[str, ...]) -> tuple[d
         sources = {name: _unpack_source(name, packed) for name, packed in whole["sources"].items()}
         picture = _unpack_columns(whole["picture"], empty_picture(len(space)))
         numbers = {name: int(whole[name]) for name in ("step", "time", "next_id")}
-        agreeing = {(int(a), int(b)): int(count) for a, b, count in whole["agreeing"]}
+        evidence = {"merges": whole["merges"], "rivals": whole["rivals"]}
     except CheckpointError:
         raise
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources = frame or intake.config.frame, sources
-    return {**numbers, "agreeing": agreeing}, picture
+    return {**numbers, **evidence}, picture
 
 
 def _pack_source(source: Source) -> dict[str, Any]:

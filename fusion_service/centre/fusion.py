@@ -13,10 +13,10 @@ from fusion_service.centre.align import predict_tracks, write_back
 from fusion_service.centre.centre import Centre
 from fusion_service.centre.existence import existence_now
 from fusion_service.centre.fusing import fuse_all
-from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.lifecycle import Picture, Support
 from fusion_service.centre.linking import Linker
 from fusion_service.centre.publishing import Contributions, live_on
-from fusion_service.centre.rows import Rows
+from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.config import CentreConfig
 
 __all__ = ["FusionCentre"]
@@ -38,10 +38,10 @@ class FusionCentre(Centre):
         self._linker = Linker(self.config, self._ids)
 
     def _kept(self) -> dict[str, Any]:
-        return {"agreeing": [[a, b, count] for (a, b), count in sorted(self._linker.agreeing.items())]}
+        return self._linker.packed()
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self._linker.agreeing = state["agreeing"]
+        self._linker.restore(state)
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         self._associate(rows, time)
@@ -65,11 +65,8 @@ class FusionCentre(Centre):
             source.tracks = replace(source.tracks, link=np.where(old[at] == link, to[at], link))
 
     def _associate(self, rows: Rows, time: int) -> None:
-        linker, journal = self._linker, self._journal
-        linker.check(rows, journal)
         now = self._predicted(time)
-        self._picture, agreements = linker.link(rows, self._picture, now, self._step, time, journal)
-        merged = linker.merge(rows, agreements, self._step, journal)
+        self._picture, merged = self._linker.link(rows, self._picture, now, self._step, time, self._journal)
         self._relink(merged)
         if merged:
             gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
@@ -81,23 +78,36 @@ class FusionCentre(Centre):
         return predict_tracks(picture, config.motion, config.space, config.space, dt)
 
     def _live(self, rows: Rows, time: int) -> None:
-        tracks, picture, linked = rows.tracks, self._picture, rows.linked()
-        at = picture.find(tracks.link[linked])
-        support = np.bincount(at, minlength=len(picture.id))
-        updated = picture.updated.copy()
-        np.maximum.at(updated, at, tracks.updated[linked])
-        newest = np.full(len(picture.id), -1, dtype=np.int64)
-        np.maximum.at(newest, at, tracks.time[linked])
+        tracks, picture, inside = rows.tracks, self._picture, rows.inside()
+        at = picture.find(tracks.link[inside])
+        updated, newest = picture.updated.copy(), np.full(len(picture.id), -1, dtype=np.int64)
+        np.maximum.at(updated, at, tracks.updated[inside])
+        np.maximum.at(newest, at, tracks.time[inside])
         fresh = newest > picture.seen
         existence = existence_now(rows, picture, fresh, self._intake, time)
         seen = np.maximum(picture.seen, newest)
         picture = replace(picture, updated=updated, existence=existence, seen=seen)
-        picture, ended = live_on(picture, time, support, fresh, self.config, self._journal)
+        support = self._support(rows, inside, at, len(picture.id), time)
+        picture, ended = live_on(picture, time, support, self.config, self._journal)
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
+        tracks.link[np.isin(tracks.link, picture.id[ended])] = NO_TRACK
         self._picture = picture.take(~ended)
 
+    def _support(self, rows: Rows, inside: NDArray[np.intp], at: NDArray[np.intp], count: int, time: int) -> Support:
+        """What feeds each global track. A report is overdue by half of its interval, or a step, whichever is longer;
+        where the source's token is gone, by nothing."""
+        interval = rows.interval[inside]
+        slack = np.maximum(interval // 2, round(self.config.period * 1e9))
+        expected = rows.tracks.seen[inside] + interval + np.where(rows.lost[inside], 0, slack)
+        due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
+        np.maximum.at(due, at, expected)
+        np.maximum.at(slowest, at, interval)
+        sources = np.bincount(at[expected >= time], minlength=count)
+        hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
+        return Support(sources, hit, due, slowest)
+
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
-        picture, tracks, linked = self._picture, rows.tracks, rows.linked()
-        linked = linked[np.argsort(tracks.link[linked], kind="stable")]
-        counts = np.bincount(picture.find(tracks.link[linked]), minlength=len(picture.id))
-        return Contributions(counts, rows.source[linked], rows.epoch[linked], tracks.id[linked], influence[linked])
+        picture, tracks, inside = self._picture, rows.tracks, rows.inside()
+        inside = inside[np.argsort(tracks.link[inside], kind="stable")]
+        counts = np.bincount(picture.find(tracks.link[inside]), minlength=len(picture.id))
+        return Contributions(counts, rows.source[inside], rows.epoch[inside], tracks.id[inside], influence[inside])

@@ -24,7 +24,7 @@ from fusion_service import linalg
 from fusion_service.centre.association import candidate_pairs, cluster, pair_distance
 from fusion_service.centre.cells import Components, find_cells, fuse_cells, reduced
 from fusion_service.centre.centre import Centre
-from fusion_service.centre.lifecycle import Picture, newborn
+from fusion_service.centre.lifecycle import Picture, Support, newborn
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import Rows
 from fusion_service.config import CentreConfig
@@ -66,7 +66,7 @@ class IntensityCentre(Centre):
         self._fused = self._nothing(0)
 
     def _kept(self) -> dict[str, Any]:
-        return {"agreeing": []}
+        return {"merges": [], "rivals": []}
 
     def _restore(self, state: dict[str, Any]) -> None:
         """The intensity is fused anew in every step."""
@@ -194,7 +194,13 @@ class IntensityCentre(Centre):
         fresh = newest > picture.seen
         seen, updated = np.maximum(picture.seen, newest), np.maximum(picture.updated, newest)
         picture = replace(picture, seen=seen, updated=updated)
-        picture, ended = live_on(picture, time, supporting.sum(axis=0), fresh, self.config, self._journal)
+        period = np.array(
+            [round(self._intake.declared(self._intake.sources[name]).period * 1e9) for name in names], dtype=np.int64
+        )
+        slowest = np.max(np.where(supporting, period[:, None], 0), axis=0, initial=0)
+        due = np.where(supporting.any(axis=0), time + slowest + np.maximum(slowest // 2, 10**9), -1)
+        support = Support(supporting.sum(axis=0), fresh, due, slowest)
+        picture, ended = live_on(picture, time, support, self.config, self._journal)
         return picture.take(~ended), ended
 
     def _contributions(self, share: Floats, names: tuple[str, ...]) -> Contributions:

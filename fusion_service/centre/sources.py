@@ -20,6 +20,7 @@ from fusion_service.densities import Mixtures, reduce_mixtures
 from schemas import Frame, Height, LocalTracks, SensorInfo
 
 __all__ = [
+    "LINKS",
     "REMEMBERED",
     "Columns",
     "Source",
@@ -65,8 +66,11 @@ class Tracks:
     Where some track is a mixture, parts (C > 0) hold its components, log_weight (C, T) with -inf for padding,
     part_mean (n, C, T), part_covariance (n, n, C, T), and mean and covariance are their moments; else C = 0.
     id u64; time i64 of the density; updated i64 of the last measurement; existence (NaN: not reported);
-    link u64 global id or 0; since i64 step of the link; fails i64 steps in a row that the link has failed;
-    used i64 time of the version last fused (-1: none).
+    link u64 global id or 0; since i64 step of the link; used i64 time of the version last fused (-1: none); judged
+    i64 `updated` of the newest datum that was judged, seen i64 time of the step that did; weighed i64 newest datum of
+    the others in the track when evidence was last added; data i64 how many were judged in this link; evidence f64 sum
+    for the link; outside: the newest datum failed its gate; shadow u64 global id that it is a second track of, or 0;
+    apart f64 sum for that.
     """
 
     id: NDArray[np.uint64]
@@ -80,8 +84,15 @@ class Tracks:
     updated: NDArray[np.int64]
     link: NDArray[np.uint64]
     since: NDArray[np.int64]
-    fails: NDArray[np.int64]
     used: NDArray[np.int64]
+    judged: NDArray[np.int64]
+    weighed: NDArray[np.int64]
+    seen: NDArray[np.int64]
+    data: NDArray[np.int64]
+    evidence: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+    shadow: NDArray[np.uint64]
+    apart: NDArray[np.float64]
 
     def take(self, rows: Any) -> Tracks:
         """The given rows (indices or a mask)."""
@@ -92,7 +103,8 @@ class Tracks:
         return as_mixtures(self, rows)
 
 
-LINKS = ("link", "since", "fails", "used")
+LINKS = ("link", "since", "used", "judged", "weighed", "seen", "data", "evidence", "outside", "shadow", "apart")
+"""Columns that a new version of a track takes over from the last."""
 
 
 def empty_tracks(n: int) -> Tracks:
@@ -100,7 +112,15 @@ def empty_tracks(n: int) -> Tracks:
     whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
     ids = np.zeros(0, dtype=np.uint64)
     moments, parts = (np.zeros((n, 0)), np.zeros((n, n, 0))), no_parts(n, 0)
-    return Tracks(ids, whole, *moments, *parts, real, whole, ids, whole, whole, whole)
+    return Tracks(ids, whole, *moments, *parts, real, whole, *_unlinked(0))
+
+
+def _unlinked(count: int) -> tuple[NDArray[Any], ...]:
+    """The columns `LINKS` of tracks that nothing is known of."""
+    never, zero = np.full(count, -1, dtype=np.int64), np.zeros(count)
+    none = np.zeros(count, dtype=np.uint64)
+    data = np.zeros(count, dtype=np.int64)
+    return none, never, never, never, never, never, data, zero, np.zeros(count, dtype=np.bool_), none, zero
 
 
 def no_parts(n: int, count: int) -> tuple[Floats, Floats, Floats]:
@@ -169,7 +189,6 @@ def message_tracks(
     times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
     updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
     existence = [np.full(len(m.ids), np.nan) if m.existence is None else m.existence for m in messages]
-    none = np.full(len(times), -1, dtype=np.int64)
     return Tracks(
         id=_gather([m.ids for m in messages], sound).astype(np.uint64),
         time=times,
@@ -180,10 +199,7 @@ def message_tracks(
         part_covariance=parts[2],
         existence=_gather(existence, sound).astype(np.float64),
         updated=np.minimum(_gather(updated, sound), times),
-        link=np.zeros(len(times), dtype=np.uint64),
-        since=none,
-        fails=np.zeros(len(times), dtype=np.int64),
-        used=none,
+        **dict(zip(LINKS, _unlinked(len(times)), strict=True)),
     )
 
 

@@ -210,17 +210,22 @@ class CentreConfig:
     motion: Motion = _setting(Motion("cv", 1.0), lambda v: _build(Motion, v), "motion of a global track on its own")
     gate: float = _setting(0.999, _number(0.5, 1 - 1e-9), "probability inside the gate for a new link")
     keep_gate: float = _setting(0.9999, _number(0.5, 1 - 1e-12), "probability inside the gate for a standing link")
-    break_after: int = _setting(3, _whole(1, 255), "steps in a row that a link must fail before it is broken")
-    merge_after: int = _setting(3, _whole(1, 255), "steps in a row that two global tracks must agree to be merged")
-    confirm_hits: int = _setting(2, _whole(1, 64), "steps with new data that confirm a track ...")
-    confirm_within: int = _setting(4, _whole(1, 64), "... within so many steps")
+    merge_gate: float = _setting(0.99, _number(0.5, 1 - 1e-9), "two global tracks further apart are not the same")
+    error_rate: float = _setting(
+        1e-3, _number(1e-9, 0.2), "rate of wrong decisions about links, exchanges, merges and splits"
+    )
+    manoeuvre: float = _setting(20.0, _number(0, 1e4), "acceleration that targets may show unannounced, m/s2 (1 sigma)")
+    confirm_hits: int = _setting(2, _whole(1, 64), "reports with a new measurement that confirm a track ...")
+    confirm_within: int = _setting(4, _whole(1, 64), "... of so many that were due")
+    min_sources: int = _setting(1, _whole(1, 255), "sources that a track needs to be confirmed")
     confirm_sources: int = _setting(2, _whole(1, 64), "so many sources in one step confirm a track at once")
     confirm_existence: float = _setting(0.0, _number(0, 1), "existence needed to be confirmed")
     existence: str = _setting("consistent", _choice("consistent", "average", "geometric"), "how existence is fused")
     min_existence: float = _setting(
         0.0, _number(0, 1), "a track of less existence is tentative, or ends without support"
     )
-    coast: float = _setting(5.0, _DURATION, "seconds a confirmed track lives on without support")
+    coast: float = _setting(5.0, _DURATION, "seconds a confirmed track lives on when its reports are overdue ...")
+    coast_periods: float = _setting(3.0, _number(0, 1e3), "... or so many of its source's periods, if that is longer")
     stale_periods: float = _setting(3.0, _number(1, 1e6), "a source (or track) is stale after so many periods")
     intensity_rule: str = _setting(
         "hybrid",
@@ -238,6 +243,7 @@ class CentreConfig:
     intensity_merge: float = _setting(2.0, _number(0, 100), "d2 below which components of one mixture are merged")
     intensity_components: int = _setting(500, _whole(1, 5000), "components kept at most")
     max_pending: int = _setting(10_000, _whole(1, 10_000_000), "messages held per source for later steps")
+    fuse_origins: bool = _setting(False, _flag, "fuse live, exercise, simulated and replayed data together")
     source_defaults: SourceConfig = _setting(SourceConfig(), lambda v: v, "for every source")
     sources: dict[str, SourceConfig] = _setting({}, _table, "by name, over the defaults")
 
