@@ -1,17 +1,16 @@
 """When is it decided: sequential tests on new data, at the error rate that the config states.
 
-For each standing link a sum of log-likelihood ratios, same target against another, is kept in [-A, A] with
-A = log(1 / rate) (Wald's bound, both errors at the same rate; a sum that is held at its top is Page's test). A new
-datum adds
+For each standing link a sum of evidence, same target against another, is kept in [-A, A] with A = log(1 / rate) (Wald's
+bound, both errors at the same rate; a sum that is held at its top is Page's test). A new datum adds, d2 being its
+normalised distance to what the other sources say and q the chi-square quantile of `keep_gate`,
 
-    slope (q - d2)   between -A/2 and A/4,
+    min(slope (q - d2), A/4)  below q,     -A/2 min(1, ((d2 - q) / 3q)^2)  above it,
 
-d2 the normalised distance to what the other sources say and q the chi-square quantile of `keep_gate`: the linear form
-of the ratio of N(0, S) to a Gaussian of larger spread, which crosses 0 at q, so that a constant bias within the gate
-never adds up to a break. One outlier costs half of the way from A to nothing, a jump that no manoeuvre explains costs
-A; so a link that has stood breaks after four disagreements or two jumps in a row, and never on one datum. Two global
-tracks are merged by the same test with the lower quantile `merge_gate`: between the two lies the dead band in which a
-bias of a few sigma leaves things as they are.
+so that a constant bias of a few sigma never adds up to a break, however the errors of filters go together in time, and
+a plain disagreement takes a quarter of the way from A to -A. A jump that no manoeuvre explains takes twice that. So a
+link that has stood breaks after four plain disagreements or two jumps in a row, and never on one datum. Two global
+tracks are merged when slope (q' - d2), summed over new data, reaches A, q' being the lower quantile `merge_gate`:
+between the two lies the dead band in which a bias leaves things as they are.
 
 Rival links are weighed by the likelihood ratio itself, half the difference of d2 + log det to the standing link,
 summed over the row's new data and never below `-LOW`: an exchange needs `A` of them, less while the link is young.
@@ -37,7 +36,9 @@ Ints = NDArray[np.intp]
 LOW = 12.0
 """Least sum of a rival: how much it must make good before it counts."""
 SLOPE = 0.2
-"""Of the sum of a standing link, per unit of d2."""
+"""Of the sum of a standing link, per unit of d2 below the gate."""
+FAR = 3.0
+"""Gates beyond the gate at which a disagreement has its whole weight."""
 MERGE_SLOPE = 0.3
 YOUNG = 10
 """Data after which a link has its whole weight against an exchange."""
@@ -61,7 +62,15 @@ class Tests:
 
     def agreement(self, distance: Floats) -> Floats:
         """What a datum at d2 `distance` (M,) from the others adds to the sum of its link."""
-        return np.clip(SLOPE * (self.keep - distance), -self.bound / 2, self.bound / 4)
+        nearer = np.minimum(SLOPE * np.maximum(self.keep - distance, 0.0), self.bound / 4)
+        return nearer - self.bound / 2 * self._beyond(distance) ** 2
+
+    def jump(self, distance: Floats) -> Floats:
+        """What a datum at d2 `distance` (M,) beyond the gate of the prediction takes from the sum of its link."""
+        return -self.bound * self._beyond(distance) ** 2
+
+    def _beyond(self, distance: Floats) -> Floats:
+        return np.clip((distance - self.keep) / (FAR * self.keep), 0.0, 1.0)
 
     def sameness(self, distance: Floats) -> Floats:
         """What a datum adds to the sum for a merge of two global tracks at d2 `distance`."""
@@ -69,7 +78,7 @@ class Tests:
 
     def weight(self, data: NDArray[np.integer]) -> Floats:
         """What a standing link weighs against an exchange, after so many data (M,)."""
-        return np.asarray(0.5 * self.bound * np.minimum(data, YOUNG) / YOUNG)
+        return np.asarray(0.1 * self.bound * np.minimum(data, YOUNG) / YOUNG)
 
 
 @dataclass(slots=True)

@@ -78,7 +78,7 @@ def judge(rows: Rows, now: Picture, time: int, settings: Settings, journal: Jour
     distance[some] = _from_others(rows, linked[some], agreed)
     failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep)
     outside[failed] = True
-    _weigh(rows, linked, distance, jumped, agreed.size, some, tests)
+    _weigh(rows, linked, distance, predicted, jumped, agreed.size, some, tests)
     tracks.outside[linked] = outside
     tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
     tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
@@ -129,7 +129,9 @@ def _worst(
     return np.asarray(at[order][first])
 
 
-def _weigh(rows: Rows, linked: Ints, distance: Floats, jumped: Bools, size: Ints, some: Ints, tests: Tests) -> None:
+def _weigh(
+    rows: Rows, linked: Ints, distance: Floats, predicted: Floats, jumped: Bools, size: Ints, some: Ints, tests: Tests
+) -> None:
     """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
     tracks, fresh = rows.tracks, rows.fresh[linked]
     others = np.full(len(linked), -1, dtype=np.int64)
@@ -139,7 +141,7 @@ def _weigh(rows: Rows, linked: Ints, distance: Floats, jumped: Bools, size: Ints
     weighed = fresh & together & ~jumped & (others > tracks.weighed[linked])
     more = np.where(weighed, np.nan_to_num(tests.agreement(distance), nan=0.0), 0.0)
     more = np.where(fresh & ~together & ~jumped, tests.bound / 4, more)
-    more = np.where(jumped, -tests.bound, more)
+    more = np.where(jumped, tests.jump(predicted), more)
     tracks.evidence[linked] = np.clip(tracks.evidence[linked] + more, -tests.bound, tests.bound)
     tracks.weighed[linked] = np.where(weighed, others, tracks.weighed[linked])
 

@@ -41,6 +41,8 @@ MOST_BYTES = 12_000_000
 STANDING = 1000.0
 """What a row that is believed in its track is worth there: nothing but an exchange can take it away."""
 MOST_RIVAL = 50.0
+MEMORY = 0.75
+"""Of the sum of a rival, kept at each new datum: a filter's newest state holds most of what its earlier ones said."""
 
 
 class Linker:
@@ -114,7 +116,7 @@ class Linker:
         more = 0.5 * (near.own[rivals.first] - (rivals.distance + rivals.spread))
         more = np.where(np.isfinite(more), more, 0.0)
         before = self.rivals.sums(rows, now, rivals.first, rivals.second)
-        return np.clip(before + more, -LOW, MOST_RIVAL)
+        return np.clip(MEMORY * before + more, -LOW, MOST_RIVAL)
 
     def _options(
         self, rows: Rows, now: Picture, near: Candidates, sums: Floats, weight: Floats, name: int, touched: Bools
