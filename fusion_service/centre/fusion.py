@@ -104,7 +104,8 @@ class FusionCentre(Centre):
         np.maximum.at(slowest, at, interval)
         sources = np.bincount(at[expected >= time], minlength=count)
         hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
-        return Support(sources, hit, due, slowest)
+        linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
+        return Support(sources, hit, due, slowest, linked == 0)
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()
