@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.colours import FUSED, TRUTH, source_colours
+from fusion_service.colours import PAPER_FUSED, PAPER_TRUTH, source_colours
 from fusion_service.geodesy import FrameError, ecef_to_geodetic, transform
-from fusion_service.recording.drawing.geometry import outline
+from fusion_service.recording.drawing.geometry import QUANTILE, circle, outline
 from fusion_service.review.snapshots import in_frame, order, truth_path, truth_positions
 from schemas import Ecef, Enu, Frame, GlobalTracks, LocalTracks, Message, SensorInfo, Truth, check_numbers
 from schemas.messages import TENTATIVE
@@ -30,9 +30,7 @@ __all__ = ["mission_map"]
 
 Floats = NDArray[np.float64]
 
-QUANTILE = -2 * math.log(0.05)
-"""A Gaussian's position lies inside (p - mean)' P^-1 (p - mean) = QUANTILE with 95 %."""
-RING = np.stack([f(np.linspace(0, 2 * np.pi, 49)) for f in (np.cos, np.sin)], axis=-1)
+RING = np.ascontiguousarray(circle(48).T)
 VISIBLE = 0.006
 """The semi-axis an ellipse needs to be seen, as a share of the map's width."""
 MAX_LABELS = 60
@@ -261,16 +259,17 @@ def _draw_tracks(axes: Axes, mission: _Mission, metres: float, when: set[int] | 
     axes.grid(color="#e8e8e8", lw=0.6)
     axes.set_axisbelow(True)
     paths = [xy / metres for _, xy in mission.truth.values()]
-    axes.add_collection(LineCollection(paths, colors=TRUTH, lw=5, alpha=0.55, capstyle="round", zorder=2))
-    axes.plot(*np.array([path[0] for path in paths]).reshape(-1, 2).T, "o", color=TRUTH, ms=6, zorder=2)
+    axes.add_collection(LineCollection(paths, colors=PAPER_TRUTH, lw=5, alpha=0.55, capstyle="round", zorder=2))
+    axes.plot(*np.array([path[0] for path in paths]).reshape(-1, 2).T, "o", color=PAPER_TRUTH, ms=6, zorder=2)
     for name, tracks in mission.local.items():
         lines = [track.xy / metres for track in tracks]
         axes.add_collection(LineCollection(lines, colors=mission.colours[name], lw=2.2, alpha=0.8, zorder=3))
         dots = np.concatenate(lines or [np.zeros((0, 2))])
         axes.plot(*dots.T, ".", color=mission.colours[name], ms=5, alpha=0.9, zorder=3)
-    axes.add_collection(LineCollection([track.xy / metres for track in mission.fused], colors=FUSED, lw=1.0, zorder=4))
+    lines = [track.xy / metres for track in mission.fused]
+    axes.add_collection(LineCollection(lines, colors=PAPER_FUSED, lw=1.0, zorder=4))
     rings = [ring / metres for ring in _rings(mission.fused, when, scale)]
-    axes.add_collection(LineCollection(rings, colors=FUSED, lw=0.9, zorder=5))
+    axes.add_collection(LineCollection(rings, colors=PAPER_FUSED, lw=0.9, zorder=5))
 
 
 def _rings(tracks: Sequence[_Track], when: set[int] | None, scale: float = 1.0) -> list[Floats]:
@@ -337,15 +336,15 @@ def _within(mission: _Mission, low: Floats, high: Floats) -> _Mission:
 def _handles(mission: _Mission, scale: int) -> list[object]:
     from matplotlib.lines import Line2D
 
-    handles = (
-        [Line2D([], [], color=TRUTH, lw=5, alpha=0.55, label="truth, a dot where it starts")] if mission.truth else []
-    )
+    handles = []
+    if mission.truth:
+        handles.append(Line2D([], [], color=PAPER_TRUTH, lw=5, alpha=0.55, label="truth, a dot where it starts"))
     for name, colour in mission.colours.items():
         count = len(mission.local.get(name, ()))
         handles.append(Line2D([], [], color=colour, lw=2.2, marker=".", label=f"{name}, local tracks: {count}"))
-    handles.append(Line2D([], [], color=FUSED, lw=1.0, label=f"fused tracks: {len(mission.fused)}"))
+    handles.append(Line2D([], [], color=PAPER_FUSED, lw=1.0, label=f"fused tracks: {len(mission.fused)}"))
     magnified = f", drawn {scale} times as large" if scale > 1 else ""
-    ring: dict[str, Any] = {"marker": "o", "mfc": "none", "mec": FUSED, "ms": 11, "ls": "none"}
+    ring: dict[str, Any] = {"marker": "o", "mfc": "none", "mec": PAPER_FUSED, "ms": 11, "ls": "none"}
     handles.append(Line2D([], [], label=f"95 % ellipse of a fused track{magnified}", **ring))
     if mission.sensors:
         handles.append(Line2D([], [], color="#555555", marker="^", ms=9, ls="--", label="sensor and its field of view"))

@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from fusion_service.recording import read
-from fusion_service.recording.drawing.geometry import moments
+from fusion_service.recording.drawing.geometry import track_moments
 from schemas import Ecef, Enu, Local, Message, Polygon, encode, global_key, local_key
 from tests.helpers import missions
 from tests.recording.contents import opacities, record, row, rows, texts
@@ -146,7 +146,7 @@ def test_a_mixture_is_drawn_by_its_moments() -> None:
     means, roots = rng.normal(0, 10, (6, 4)), rng.normal(0, 1, (6, 4, 4))
     covariances = roots @ roots.transpose(0, 2, 1) + np.eye(4)
     mixed = missions.tracks("a", 0, [1, 2, 3], [], means=means, covariances=covariances, counts=counts, weights=weights)
-    mean, covariance = moments(mixed)
+    mean, covariance = track_moments(mixed)
     for track, part in enumerate((slice(0, 2), slice(2, 5), slice(5, 6))):
         w = weights[part]
         second = np.einsum("c,cij->ij", w, covariances[part] + np.einsum("ci,cj->cij", means[part], means[part]))

@@ -26,8 +26,16 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.colours import (
+    SCREEN_GRID,
+    SCREEN_NEUTRAL,
+    SCREEN_TRUTH,
+    Colour,
+    centre_colours,
+    packed,
+    screen_source_colours,
+)
 from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
-from fusion_service.recording.drawing import palette
 from fusion_service.recording.drawing.focus import extent, near, predicted
 from fusion_service.recording.drawing.geometry import (
     CORNERS,
@@ -37,9 +45,9 @@ from fusion_service.recording.drawing.geometry import (
     Place,
     ellipses,
     grid,
-    moments,
     outline,
     rings,
+    track_moments,
 )
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.drawing.links import links
@@ -82,8 +90,8 @@ class Drawing:
         self.chart: Chart | None = None if frame is None else Chart(frame)
         self.trails: list[str] = []
         self.sources: dict[str, str] = {}
-        self.colours: dict[str, palette.Colour] = {}
-        self.centres: dict[str, palette.Colour] = {}
+        self.colours: dict[str, Colour] = {}
+        self.centres: dict[str, Colour] = {}
         self._told: dict[str, deque[Table]] = {}
         self._messages: dict[str, deque[tuple[LocalTracks, NDArray[np.bool_]]]] = {}
         self.linked: set[tuple[str, str]] = set()
@@ -97,7 +105,7 @@ class Drawing:
         self.changed = True
         self.label = Labels()
         self._tables: dict[str, Table] = {}
-        self._tones: dict[str, palette.Colour] = {}
+        self._tones: dict[str, Colour] = {}
         self._mixed: set[str] = set()
         self._recolour = False
         self._info: dict[str, SensorInfo] = {}
@@ -142,7 +150,7 @@ class Drawing:
     def local_tracks(self, message: LocalTracks, sound: NDArray[np.bool_], stamp: Stamp) -> int:
         """`sound` (T,): the tracks that are drawn. Returns how many components are too many to draw."""
         self._source(message.source)
-        means, covariances = moments(message)
+        means, covariances = track_moments(message)
         place = self._chart.place(means[sound], covariances[sound], message.space, message.frame, message.height)
         ids = message.ids[sound]
         mass = None if message.existence is None else message.existence[sound]
@@ -167,14 +175,14 @@ class Drawing:
 
     def global_tracks(self, message: GlobalTracks, sound: NDArray[np.bool_], stamp: Stamp) -> int:
         """`sound` (T,): the tracks that are drawn. Returns how many components are too many to draw."""
-        means, covariances = moments(message)
+        means, covariances = track_moments(message)
         place = self._chart.place(means[sound], covariances[sound], message.space, message.frame)
         status, mass = message.status[sound], message.existence[sound]
         table = tabulate(message.epoch, message.time, message.ids[sound], place, status, mass)
         self._grow(table.place.xy, main=True)
         path = entity("picture", "global", message.source)
         if self._first(path):
-            self.centres = palette.centre_colours([*self.centres, message.source])
+            self.centres = centre_colours([*self.centres, message.source])
             self._recolour = True
         over = self._components(f"{path}/components", message, sound, stamp)
         table = self._trail(path, table, message.time, 0, stamp)
@@ -222,9 +230,9 @@ class Drawing:
         here = 0.0
         for kind, name, part in near(message, track, table, local, truth):
             path = entity("near", message.source, *(() if kind == "global" else (kind, name)))
-            colour = self.colours.get(name, palette.NEUTRAL)
+            colour = self.colours.get(name, SCREEN_NEUTRAL)
             if kind != "local":
-                colour = self.centres[name] if kind == "global" else palette.TRUTH
+                colour = self.centres[name] if kind == "global" else SCREEN_TRUTH
             if self._tones.get(path) != colour:
                 bold = kind == "global"
                 self._style(path, colour, radius=4.0, width=WIDTH, alpha=255, labels=False, weighed=bold)
@@ -242,7 +250,7 @@ class Drawing:
 
     def _rings(self, reach: float) -> None:
         """Circles at round distances from the `focus`, with their radii."""
-        rr, tone, text = self._rr, palette.packed(palette.GRID), palette.packed(palette.TRUTH)
+        rr, tone, text = self._rr, packed(SCREEN_GRID), packed(SCREEN_TRUTH)
         radii, labels = rings(reach)
         circles = [radius * RING.T for radius in radii]
         self._columns.static("/near/grid", rr.LineStrips2D(circles, colors=[tone], radii=[-0.5], draw_order=1.0))
@@ -266,7 +274,7 @@ class Drawing:
         self._grow(table.place.xy, main=True)
         path = self._scenarios[message.source] = entity("picture", "truth", message.source)
         if self._first(path):
-            self._style(path, palette.TRUTH, radius=2.0, width=0.5, alpha=255, labels=False)
+            self._style(path, SCREEN_TRUTH, radius=2.0, width=0.5, alpha=255, labels=False)
         table = self._trail(path, table, message.time, 0, stamp)
         self._tracks(path, table, [f"target {track}" for track in table.ids.tolist()], stamp)
 
@@ -384,14 +392,14 @@ class Drawing:
             path = entity("picture", "global", name)
             if self._tones.get(path) != colour:
                 self._style(path, colour, radius=4.5, width=WIDTH, alpha=255, labels=True, weighed=True)
-        for name, colour in palette.source_colours(self.sources).items():
+        for name, colour in screen_source_colours(self.sources).items():
             if self.colours.get(name) == colour:
                 continue
             self.colours[name] = colour
             self._style(self.sources[name], colour, radius=2.5, width=0.75, alpha=130, labels=False)
             path = entity("picture", "sensors", name)
-            self._columns.static(path, *_both(self._rr, "Points", colors=[palette.packed(colour)], radii=[-6.0]))
-            edge = _both(self._rr, "Lines", colors=[palette.packed(colour, 110)], radii=[-0.75])
+            self._columns.static(path, *_both(self._rr, "Points", colors=[packed(colour)], radii=[-6.0]))
+            edge = _both(self._rr, "Lines", colors=[packed(colour, 110)], radii=[-0.75])
             self._columns.static(f"{path}/coverage", *edge)
             for centre, source in self.linked:
                 if source == name:
@@ -399,7 +407,7 @@ class Drawing:
 
     def _style_links(self, centre: str, source: str) -> None:
         """Thin, under the tracks."""
-        tone = palette.packed(self.colours.get(source, palette.NEUTRAL), LINK)
+        tone = packed(self.colours.get(source, SCREEN_NEUTRAL), LINK)
         path = _links_path(centre, source)
         self._columns.static(path, *_both(self._rr, "Lines", colors=[tone], radii=[-0.5]))
         self._columns.static(path, self._rr.LineStrips2D.from_fields(draw_order=10.0))
@@ -407,7 +415,7 @@ class Drawing:
     def _style(
         self,
         path: str,
-        colour: palette.Colour,
+        colour: Colour,
         *,
         radius: float,
         width: float,
@@ -419,11 +427,11 @@ class Drawing:
         rr, static = self._rr, self._columns.static
         self._tones[path] = colour
         alphas = np.linspace(FAINTEST, 255, LEVELS).round().astype(int).tolist()
-        shades = [palette.packed(colour, opacity) for opacity in alphas]
+        shades = [packed(colour, opacity) for opacity in alphas]
         static(path, rr.AnnotationContext([rr.AnnotationInfo(k, color=shade) for k, shade in enumerate(shades)]))
         static(path, *_both(rr, "Points", radii=[-radius]))
         static(path, rr.Points2D.from_fields(show_labels=labels))
-        faint = palette.packed(colour, alpha)
+        faint = packed(colour, alpha)
         edge = _both(rr, "Lines", colors=[faint], radii=[-width])
         if weighed:  # what is static counts, whatever the rows say
             edge = (rr.GeoLineStrings.from_fields(colors=[faint]),)
@@ -439,7 +447,7 @@ class Drawing:
             return
         static(path, *_both(rr, "Points", radii=[-2.0]))
         static(path, rr.Points2D.from_fields(show_labels=False, draw_order=12.0))
-        static(f"{path}/ellipses", rr.GeoLineStrings.from_fields(colors=[palette.packed(colour)]))
+        static(f"{path}/ellipses", rr.GeoLineStrings.from_fields(colors=[packed(colour)]))
         static(f"{path}/ellipses", rr.LineStrips2D.from_fields(draw_order=11.0))
 
     def _grow(self, xy: Floats, *, main: bool) -> None:
@@ -458,12 +466,12 @@ class Drawing:
         self._grid = centre - half, centre + half
         self.changed = True
         lines, labels = grid(*self._grid)
-        rr, tone = self._rr, palette.packed(palette.GRID)
+        rr, tone = self._rr, packed(SCREEN_GRID)
         plane = [line * (1, -1) for line in lines]
         self._columns.static("/grid", rr.LineStrips2D(plane, colors=[tone], radii=[-0.5], draw_order=1.0))
         corner = centre - 0.94 * half
         places = [np.where(line[0] == line[1], line[0], corner) * (1, -1) for line in lines]
-        text = palette.packed(palette.TRUTH)
+        text = packed(SCREEN_TRUTH)
         self._columns.static("/grid/labels", rr.Points2D(places, labels=labels, colors=[text], radii=[-0.5]))
 
     @property

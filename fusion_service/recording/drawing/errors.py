@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from fusion_service import geodesy, metrics
 from fusion_service.recording.columns import Stamp
-from fusion_service.recording.drawing.geometry import moments
+from fusion_service.recording.drawing.geometry import track_moments
 from schemas import STATUSES, GlobalTracks, Truth
 
 __all__ = ["Assessment", "Score"]
@@ -100,7 +100,7 @@ class Assessment:
         self, message: GlobalTracks, stamp: Stamp, ids: NDArray[np.uint64], positions: Floats, names: tuple[str, ...]
     ) -> Score:
         index = [message.space.index(name) for name in names]
-        means, covariances = moments(message)
+        means, covariances = track_moments(message)
         shown = np.flatnonzero(message.status != STATUSES.index("tentative"))
         means, covariances = means[shown][:, index], covariances[shown][:, index][:, :, index]
         sound = np.isfinite(means).all(axis=1) & (np.linalg.det(covariances) > 0)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.recording.drawing.geometry import moments
+from fusion_service.recording.drawing.geometry import track_moments
 from fusion_service.recording.drawing.tables import Table
 from schemas import GlobalTracks, LocalTracks
 
@@ -62,7 +62,7 @@ def near(
 
 def predicted(message: LocalTracks, time: int) -> tuple[Floats, Floats]:
     """Means (T, n) and covariances (T, n, n) of the tracks, moved on to `time` by their velocities."""
-    means, covariances = moments(message)
+    means, covariances = track_moments(message)
     F = np.eye(len(message.space))
     for name in "xyz":
         if name in message.space and f"v{name}" in message.space:

@@ -14,17 +14,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy
-from schemas import Disk, Ecef, Enu, Frame, Height, LocalIntensity, Polygon, Sector, SensorInfo
-from schemas.messages import GlobalTracks, LocalTracks
+from fusion_service.densities import moments
+from schemas import Disk, Ecef, Enu, Frame, GlobalTracks, Height, LocalTracks, Polygon, Sector, SensorInfo
 
-__all__ = ["RING", "Chart", "Outline", "Place", "ellipses", "grid", "moments", "outline", "rings"]
+__all__ = [
+    "CORNERS",
+    "QUANTILE",
+    "RING",
+    "Chart",
+    "Outline",
+    "Place",
+    "circle",
+    "ellipses",
+    "grid",
+    "outline",
+    "rings",
+    "track_moments",
+]
 
 Floats = NDArray[np.float64]
-Tracks = LocalTracks | GlobalTracks
 
 QUANTILE = -2 * math.log(0.05)
+"""A Gaussian's position lies inside (p - mean)' P^-1 (p - mean) = QUANTILE with 95 %."""
 CORNERS = 24
-RING = np.stack([f(np.linspace(0, 2 * np.pi, CORNERS + 1)) for f in (np.cos, np.sin)])
+
+
+def circle(corners: int = CORNERS) -> Floats:
+    """Points (2, corners + 1) of the unit circle, the last one the first again."""
+    return np.stack([f(np.linspace(0, 2 * np.pi, corners + 1)) for f in (np.cos, np.sin)])
+
+
+RING = circle()
 
 
 class Place(NamedTuple):
@@ -43,20 +63,9 @@ class Outline(NamedTuple):
     owner: NDArray[np.int64]
 
 
-def moments(message: Tracks | LocalIntensity) -> tuple[Floats, Floats]:
-    """Mean (T, n) and covariance (T, n, n) of each track: a mixture by its moments, an intensity by component."""
-    means, covariances = message.means, message.covariances
-    if isinstance(message, LocalIntensity) or message.counts is None or message.weights is None:
-        return means, covariances
-    counts = message.counts.astype(np.intp)
-    if not len(counts):
-        return means[:0], covariances[:0]
-    starts, owner = np.cumsum(counts) - counts, np.repeat(np.arange(len(counts)), counts)
-    weights = message.weights
-    mean = np.add.reduceat(weights[:, None] * means, starts)
-    apart = means - mean[owner]
-    spread = covariances + apart[:, :, None] * apart[:, None, :]
-    return mean, np.add.reduceat(weights[:, None, None] * spread, starts)
+def track_moments(message: LocalTracks | GlobalTracks) -> tuple[Floats, Floats]:
+    """Mean (T, n) and covariance (T, n, n) of each track: a mixture by its moments."""
+    return moments(message.means, message.covariances, message.weights, message.counts)
 
 
 class Chart:

@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.colours import FUSED, SOURCES, source_colours
+from fusion_service.colours import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAPER_FUSED,
+    PAPER_TRUTH,
+    SKY,
+    SOURCES,
+    VERMILION,
+    source_colours,
+)
 from fusion_service.review.evaluation.logbook import BINS
 from fusion_service.review.evaluation.scoring import WINDOW, Scores
 from fusion_service.review.evaluation.tables import Row, row_name
@@ -30,7 +40,7 @@ POINTS = 500
 """Points of a line, at most: means over equal parts of the mission where there are more times."""
 SIZE = (5.0, 3.0)
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-PARTS = {"localisation": "#56b4e9", "missed": "#e69f00", "false": "#d55e00"}
+PARTS = {"localisation": SKY, "missed": ORANGE, "false": VERMILION}
 STYLE: Any = {
     "svg.fonttype": "none",
     "text.parse_math": False,
@@ -123,7 +133,7 @@ def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str)
             wide = 8 if delay.n < 64 else wide
             share = np.array(delay.counts).reshape(-1, wide).sum(axis=1) / delay.n
             edges = 1000 * np.array(delay.edges)[::wide]
-            axes.stairs(100 * share, edges, color=colours.get(name, FUSED), label=name, lw=1.4)
+            axes.stairs(100 * share, edges, color=colours.get(name, PAPER_FUSED), label=name, lw=1.4)
         axes.set(xlabel="delay, ms", ylabel="messages, %", ylim=(0, None))
         _legend(axes)
 
@@ -143,8 +153,8 @@ def _lines(rows: Sequence[Row]) -> list[tuple[str, str, float, Scores, Floats]]:
         lines = [(name, colours[name], 1.2, scores, seconds) for name, scores in first.sources.items()]
         if first.centre is None:
             return lines
-        return [*lines, (f"fused, {rows[0].rule}", FUSED, 2.0, first.fused, seconds)]
-    palette = (FUSED, *SOURCES)
+        return [*lines, (f"fused, {rows[0].rule}", PAPER_FUSED, 2.0, first.fused, seconds)]
+    palette = (PAPER_FUSED, *SOURCES)
     return [
         (row_name(row, rows), palette[k % len(palette)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
         for k, row in enumerate(rows)
@@ -190,8 +200,8 @@ def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats
 def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]]) -> None:
     _, _, _, fused, seconds = lines[-1] if lines[-1][0].startswith("fused") else lines[0]
     x, low = _thin(seconds, fused.series.low)
-    axes.fill_between(x, low, _thin(seconds, fused.series.high)[1], color="#009e73", alpha=0.18, lw=0, label="95 %")
-    axes.axhline(1.0, color="#009e73", lw=0.8)
+    axes.fill_between(x, low, _thin(seconds, fused.series.high)[1], color=GREEN, alpha=0.18, lw=0, label="95 %")
+    axes.axhline(1.0, color=GREEN, lw=0.8)
     for name, colour, width, scores, at in lines:
         axes.plot(*_thin(at, scores.series.anees), color=colour, lw=width, label=name)
     values = np.concatenate([scores.series.anees[np.isfinite(scores.series.anees)] for *_, scores, _ in lines])
@@ -203,11 +213,11 @@ def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]]) -
 def _cardinality(axes: Axes, rows: Sequence[Row]) -> None:
     first = rows[0].evaluation
     seconds = _seconds(first.times)
-    axes.plot(*_thin(seconds, first.exists.sum(axis=1).astype(float)), color="#999999", lw=4, alpha=0.6, label="true")
+    axes.plot(*_thin(seconds, first.exists.sum(axis=1).astype(float)), color=PAPER_TRUTH, lw=4, alpha=0.6, label="true")
     if len(rows) == 1:
-        axes.plot(*_thin(seconds, first.fused.series.shown.astype(float)), color=FUSED, label="shown")
+        axes.plot(*_thin(seconds, first.fused.series.shown.astype(float)), color=PAPER_FUSED, label="shown")
         if np.isfinite(first.fused.series.expected).any():
-            axes.plot(*_thin(seconds, first.fused.series.expected), "--", color="#0072b2", lw=1.2, label="expected")
+            axes.plot(*_thin(seconds, first.fused.series.expected), "--", color=BLUE, lw=1.2, label="expected")
     else:
         for name, colour, width, scores, at in _lines(rows):
             axes.plot(*_thin(at, scores.series.shown.astype(float)), color=colour, lw=width, label=name)
@@ -218,9 +228,9 @@ def _cardinality(axes: Axes, rows: Sequence[Row]) -> None:
 def _siap(axes: Axes, row: Row) -> None:
     series, seconds = row.evaluation.fused.series, _seconds(row.evaluation.times)
     for name, label, colour in (
-        ("completeness", "complete", "#009e73"),
-        ("spuriousness", "spurious", "#d55e00"),
-        ("ambiguity", "tracks per target", "#0072b2"),
+        ("completeness", "complete", GREEN),
+        ("spuriousness", "spurious", VERMILION),
+        ("ambiguity", "tracks per target", BLUE),
     ):
         axes.plot(*_thin(seconds, getattr(series, name)), color=colour, label=label)
     axes.set(xlabel="s since the first scored time", ylabel="share, number", ylim=(-0.03, None))
@@ -228,7 +238,7 @@ def _siap(axes: Axes, row: Row) -> None:
 
 
 def _confirm(axes: Axes, rows: Sequence[Row]) -> None:
-    palette = (FUSED, *SOURCES)
+    palette = (PAPER_FUSED, *SOURCES)
     for k, row in enumerate(rows):
         known = int((row.evaluation.begins >= 0).sum())
         after = np.sort(row.evaluation.confirm[np.isfinite(row.evaluation.confirm)])
