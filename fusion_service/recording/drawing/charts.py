@@ -28,8 +28,8 @@ from fusion_service.colours import (
     series_colour,
     shade,
 )
-from fusion_service.recording.columns import Columns, Stamp, entity, import_rerun
-from fusion_service.recording.drawing.errors import Score
+from fusion_service.recording.columns import ColumnWriter, Stamp, entity, import_rerun
+from fusion_service.recording.drawing.errors import StepErrors
 from fusion_service.recording.drawing.geometry import track_moments
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks
 from schemas.messages import TENTATIVE
@@ -47,7 +47,7 @@ in all. A new part of the recording counts anew."""
 class Charts:
     """Turns messages and scores into points of time series, each with its colour and name."""
 
-    def __init__(self, columns: Columns, focus: int | None = None) -> None:
+    def __init__(self, columns: ColumnWriter, focus: int | None = None) -> None:
         self._rr = import_rerun()
         self._columns = columns
         self._focus = focus
@@ -141,7 +141,7 @@ class Charts:
                 if number in shares or path in self._styles:
                     self._add(path, stamp, shares.get(number, np.nan), tone, name, 2.0)
 
-    def score(self, score: Score, centres: dict[str, Colour]) -> int:
+    def score(self, score: StepErrors, centres: dict[str, Colour]) -> int:
         """Returns how many targets have no series, because there are enough."""
         centre, stamp, left_out = score.centre, score.stamp, 0
         own = centres.get(centre, SCREEN_FUSED)

@@ -35,8 +35,9 @@ from fusion_service.colours import (
     packed,
     screen_source_colours,
 )
-from fusion_service.recording.columns import Columns, Lines, Points, Stamp, entity, import_rerun
-from fusion_service.recording.drawing.focus import extent, near, predicted
+from fusion_service.linalg import FloatArray
+from fusion_service.recording.columns import ColumnWriter, Lines, Points, Stamp, entity, import_rerun
+from fusion_service.recording.drawing.focus import extent, neighbours, predicted
 from fusion_service.recording.drawing.geometry import (
     CORNERS,
     RING,
@@ -51,12 +52,11 @@ from fusion_service.recording.drawing.geometry import (
 )
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.drawing.links import links
-from fusion_service.recording.drawing.tables import COASTING, LEVELS, Table, components, hold, levels, tabulate
+from fusion_service.recording.drawing.tables import COASTING, LEVELS, Table, drawn_components, hold, levels, tabulate
 from schemas import Frame, GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, Truth
 
 __all__ = ["Drawing"]
 
-Floats = NDArray[np.float64]
 U64 = NDArray[np.uint64]
 T = TypeVar("T")
 
@@ -84,7 +84,7 @@ class Drawing:
     focus: the global track about whose path the view is, None for the whole picture.
     """
 
-    def __init__(self, columns: Columns, frame: Frame | None = None, focus: int | None = None) -> None:
+    def __init__(self, columns: ColumnWriter, frame: Frame | None = None, focus: int | None = None) -> None:
         self._rr = import_rerun()
         self._columns = columns
         self.chart: Chart | None = None if frame is None else Chart(frame)
@@ -100,8 +100,8 @@ class Drawing:
         self.reach = 1.0
         """Half the width, m, of the view that goes along with the `focus`."""
         self._scenarios: dict[str, str] = {}
-        self._sight: tuple[Floats, Floats] | None = None
-        self._path: tuple[Floats, Floats] | None = None
+        self._sight: tuple[FloatArray, FloatArray] | None = None
+        self._path: tuple[FloatArray, FloatArray] | None = None
         self.changed = True
         self.label = Labels()
         self._tables: dict[str, Table] = {}
@@ -109,8 +109,8 @@ class Drawing:
         self._mixed: set[str] = set()
         self._recolour = False
         self._info: dict[str, SensorInfo] = {}
-        self._extents: dict[bool, tuple[Floats, Floats]] = {}
-        self._grid: tuple[Floats, Floats] | None = None
+        self._extents: dict[bool, tuple[FloatArray, FloatArray]] = {}
+        self._grid: tuple[FloatArray, FloatArray] | None = None
 
     def open_chart(self, message: LocalTracks | LocalIntensity | GlobalTracks | SensorInfo | Truth) -> None:
         """Draw in the frame of `message` from now on."""
@@ -123,7 +123,7 @@ class Drawing:
         self.chart = Chart(message.frame, near)
 
     @property
-    def extent(self) -> tuple[Floats, Floats] | None:
+    def extent(self) -> tuple[FloatArray, FloatArray] | None:
         """South-west and north-east corner (2,) of what is drawn in m: sensors, global tracks and truth, or else
         the local tracks."""
         return self._extents.get(True) or self._extents.get(False)
@@ -228,7 +228,7 @@ class Drawing:
         local = {name: one for name, one in known if one is not None}
         truth = {name: self._tables[own] for name, own in self._scenarios.items() if own in self._tables}
         here = 0.0
-        for kind, name, part in near(message, track, table, local, truth):
+        for kind, name, part in neighbours(message, track, table, local, truth):
             path = entity("near", message.source, *(() if kind == "global" else (kind, name)))
             colour = self.colours.get(name, SCREEN_NEUTRAL)
             if kind != "local":
@@ -299,7 +299,7 @@ class Drawing:
     ) -> int:
         """Draw the components of mixtures, labelled with their weights: a row if there are any, or were before.
         Returns how many are too many."""
-        rows, owner, weights, over = components(message, sound)
+        rows, owner, weights, over = drawn_components(message, sound)
         if not len(rows) and path not in self._tables:
             return 0
         height = None if isinstance(message, GlobalTracks) else message.height
@@ -333,7 +333,7 @@ class Drawing:
     def _tracks(self, path: str, table: Table, labels: list[str], stamp: Stamp) -> None:
         self._columns.points(path, stamp, self._points(table.place, labels, levels(table)))
 
-    def _lines(self, xy: Floats, z: Floats, lengths: NDArray[np.int64], **looks: Any) -> Lines:
+    def _lines(self, xy: FloatArray, z: FloatArray, lengths: NDArray[np.int64], **looks: Any) -> Lines:
         return Lines(self._chart.plane(xy), self._chart.geo(xy, z), lengths, **looks)
 
     def _ellipses(self, path: str, table: Table, stamp: Stamp, *, weighed: bool = False, dashed: bool = False) -> None:
@@ -450,7 +450,7 @@ class Drawing:
         static(f"{path}/ellipses", rr.GeoLineStrings.from_fields(colors=[packed(colour)]))
         static(f"{path}/ellipses", rr.LineStrips2D.from_fields(draw_order=11.0))
 
-    def _grow(self, xy: Floats, *, main: bool) -> None:
+    def _grow(self, xy: FloatArray, *, main: bool) -> None:
         """Let the extent hold `xy` (T, 2); the grid and the view follow in steps."""
         if not len(xy):
             return
@@ -475,7 +475,7 @@ class Drawing:
         self._columns.static("/grid/labels", rr.Points2D(places, labels=labels, colors=[text], radii=[-0.5]))
 
     @property
-    def bounds(self) -> tuple[Floats, Floats] | None:
+    def bounds(self) -> tuple[FloatArray, FloatArray] | None:
         """South-west and north-east corner (2,) of the square that is seen at first, m: all that the grid covers, or
         the path of the `focus`."""
         return self._sight or self._grid

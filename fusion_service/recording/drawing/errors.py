@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, metrics
+from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import Stamp
 from fusion_service.recording.drawing.geometry import track_moments
 from schemas import STATUSES, GlobalTracks, Truth
 
-__all__ = ["Assessment", "Score"]
+__all__ = ["StepErrors", "TruthMatcher"]
 
-Floats = NDArray[np.float64]
 
 HELD = 512
 """Truth messages of a scenario, and global steps of a centre, that wait for each other."""
@@ -33,7 +33,7 @@ SMALLEST = 20.0
 """Without a given cut-off: so many typical standard deviations of the position, and at least so many metres."""
 
 
-class Score(NamedTuple):
+class StepErrors(NamedTuple):
     """One global step of `centre`: for each true object (T,) the distance (m) and NEES / dimension of the track
     that is assigned to it, NaN without one, and the track's id (0: none); `bounds`: where the mean NEES lies with 95 %
     for a consistent centre."""
@@ -41,8 +41,8 @@ class Score(NamedTuple):
     centre: str
     stamp: Stamp
     ids: NDArray[np.uint64]
-    error: Floats
-    nees: Floats
+    error: FloatArray
+    nees: FloatArray
     dimension: int
     tracks: NDArray[np.uint64]
 
@@ -55,7 +55,7 @@ class Score(NamedTuple):
         return metrics.nees_bounds(self.dimension, self.assigned) if self.assigned else (np.nan, np.nan)
 
 
-class Assessment:
+class TruthMatcher:
     """Matches global steps with truth as both come, in any order. `cutoff`: m, None chooses one for each step."""
 
     def __init__(self, cutoff: float | None = None) -> None:
@@ -76,7 +76,7 @@ class Assessment:
         while held > HELD_TRACKS and len(self._steps) > 1:
             held -= len(self._steps.popleft()[0].ids)
 
-    def scores(self) -> Iterator[Score]:
+    def scores(self) -> Iterator[StepErrors]:
         """Every step whose time the truth has reached; the others wait for it. `geodesy.FrameError` where the
         truth has no place in the frame of the tracks: that step is left out."""
         waiting = list(self._steps)
@@ -97,8 +97,13 @@ class Assessment:
                     yield self._score(message, stamp, *found)
 
     def _score(
-        self, message: GlobalTracks, stamp: Stamp, ids: NDArray[np.uint64], positions: Floats, names: tuple[str, ...]
-    ) -> Score:
+        self,
+        message: GlobalTracks,
+        stamp: Stamp,
+        ids: NDArray[np.uint64],
+        positions: FloatArray,
+        names: tuple[str, ...],
+    ) -> StepErrors:
         index = [message.space.index(name) for name in names]
         means, covariances = track_moments(message)
         shown = np.flatnonzero(message.status != STATUSES.index("tentative"))
@@ -116,10 +121,12 @@ class Assessment:
         nees[found] = metrics.nees(apart, covariances[assignment[found]]) / len(names)
         tracks = np.zeros(len(ids), dtype=np.uint64)
         tracks[found] = message.ids[shown[assignment[found]]]
-        return Score(message.source, stamp, ids, error, nees, len(names), tracks)
+        return StepErrors(message.source, stamp, ids, error, nees, len(names), tracks)
 
 
-def _truth_at(held: list[Truth], message: GlobalTracks) -> tuple[NDArray[np.uint64], Floats, tuple[str, ...]] | None:
+def _truth_at(
+    held: list[Truth], message: GlobalTracks
+) -> tuple[NDArray[np.uint64], FloatArray, tuple[str, ...]] | None:
     """Ids (T,), positions (T, d) in the frame of `message` at its time, and the names of the components; None
     where the truth does not reach around that time."""
     after = bisect_left(held, message.time, key=lambda item: item.time)
@@ -136,7 +143,7 @@ def _truth_at(held: list[Truth], message: GlobalTracks) -> tuple[NDArray[np.uint
     return ids, positions, names
 
 
-def _positions(truth: Truth, message: GlobalTracks) -> tuple[NDArray[np.uint64], Floats, tuple[str, ...]]:
+def _positions(truth: Truth, message: GlobalTracks) -> tuple[NDArray[np.uint64], FloatArray, tuple[str, ...]]:
     own = tuple(name for name in "xyz" if name in truth.space)
     index = [truth.space.index(name) for name in own]
     nothing = np.zeros((len(truth.ids), len(own), len(own)))

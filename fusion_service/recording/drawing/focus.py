@@ -16,19 +16,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.linalg import FloatArray
 from fusion_service.recording.drawing.geometry import track_moments
 from fusion_service.recording.drawing.tables import Table
 from schemas import GlobalTracks, LocalTracks
 
-__all__ = ["Near", "extent", "near", "predicted"]
+__all__ = ["Neighbour", "extent", "neighbours", "predicted"]
 
-Floats = NDArray[np.float64]
 
 AROUND = 5.0
 """Sigmas of the track within which true objects are shown."""
 
 
-class Near(NamedTuple):
+class Neighbour(NamedTuple):
     """Tracks of one kind ("global", "local" or "truth") and one name, at their places from the track."""
 
     kind: str
@@ -36,15 +36,15 @@ class Near(NamedTuple):
     table: Table
 
 
-def near(
+def neighbours(
     message: GlobalTracks, track: int, fused: Table, local: Mapping[str, Table], truth: Mapping[str, Table]
-) -> Iterator[Near]:
-    """Everything near global track `track` of `message`; nothing if it is not among those that are drawn, `fused`."""
+) -> Iterator[Neighbour]:
+    """What is near the global track `track` of `message`; nothing if it is not among those that are drawn, `fused`."""
     rows, drawn = np.flatnonzero(message.ids == np.uint64(track)), np.flatnonzero(fused.ids == np.uint64(track))
     if not len(rows) or not len(drawn):
         return
     origin = fused.place.xy[drawn[0]]
-    yield Near("global", message.source, _moved(fused, drawn[:1], origin))
+    yield Neighbour("global", message.source, _moved(fused, drawn[:1], origin))
     first = int(message.contributor_counts[: rows[0]].sum())
     part = slice(first, first + int(message.contributor_counts[rows[0]]))
     for index, name in enumerate(message.sources):
@@ -53,14 +53,14 @@ def near(
         mine = message.contributor_source[part] == index
         mine &= message.contributor_epoch[part] == np.uint64(table.epoch)
         told = np.flatnonzero(np.isin(table.ids, message.contributor_id[part][mine]))
-        yield Near("local", name, _moved(table, told, origin))
+        yield Neighbour("local", name, _moved(table, told, origin))
     reach = AROUND * float(np.sqrt(np.trace(fused.place.covariance[drawn[0]])))
     for name, table in truth.items():
         there = np.flatnonzero(np.linalg.norm(table.place.xy - origin, axis=1) <= reach)
-        yield Near("truth", name, _moved(table, there, origin))
+        yield Neighbour("truth", name, _moved(table, there, origin))
 
 
-def predicted(message: LocalTracks, time: int) -> tuple[Floats, Floats]:
+def predicted(message: LocalTracks, time: int) -> tuple[FloatArray, FloatArray]:
     """Means (T, n) and covariances (T, n, n) of the tracks, moved on to `time` by their velocities."""
     means, covariances = track_moments(message)
     F = np.eye(len(message.space))
@@ -78,7 +78,7 @@ def extent(table: Table) -> float:
     return float((np.linalg.norm(table.place.xy, axis=1) + 2.5 * spread).max())
 
 
-def _moved(table: Table, rows: NDArray[np.intp], origin: Floats) -> Table:
+def _moved(table: Table, rows: NDArray[np.intp], origin: FloatArray) -> Table:
     part = table.part(rows)
     return Table(
         part.epoch, part.ids, part.times, part.place._replace(xy=part.place.xy - origin), part.codes, part.mass

@@ -13,12 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.recording.columns import Columns, Stamp, documents, entity, texts
+from fusion_service.recording.columns import ColumnWriter, Stamp, documents, entity, texts
 from fusion_service.recording.drawing.drawing import Drawing
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import DECISIONS, KEPT, NO_SOURCE
 
-__all__ = ["Journal"]
+__all__ = ["EventLog"]
 
 INFO, WARN = "INFO", "WARN"
 WAITING = 1000
@@ -29,10 +29,10 @@ SAID_ELSEWHERE = ("found", "lost", "restarted")
 """Events of a service that its status, or the epoch of the messages, shows as well."""
 
 
-class Journal:
+class EventLog:
     """Turns messages into lines; repeats of one fault within a message become one line with a number."""
 
-    def __init__(self, columns: Columns, drawing: Drawing, focus: int | None = None) -> None:
+    def __init__(self, columns: ColumnWriter, drawing: Drawing, focus: int | None = None) -> None:
         self._columns = columns
         self._focus = focus
         self._label = drawing.label

@@ -23,6 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.geodesy import FrameError, transform
+from fusion_service.linalg import FloatArray
+from fusion_service.review.snapshots import Times, TrackMessage
 from schemas import (
     Frame,
     GlobalTracks,
@@ -41,10 +43,7 @@ from schemas.messages import BROKEN, CONFIRMED, GATE_FAILED, KEPT
 
 __all__ = ["Account", "Latency", "Logbook", "Silence", "Traffic"]
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
-Tracks = LocalTracks | GlobalTracks
-Step = tuple[str, int, int]
+StepKey = tuple[str, int, int]
 Name = TypeVar("Name")
 Value = TypeVar("Value")
 
@@ -146,14 +145,14 @@ class Logbook:
         self._columns["arrival"] = array("q")
         self._spreads: dict[str, array[float]] = {"local": array("d"), "global": array("d")}
         self._delays: dict[tuple[str, str], array[float]] = {}
-        self._came: dict[Step, int] = {}
+        self._came: dict[StepKey, int] = {}
         self._infos_came: dict[int, int] = {}
         """By digest: every type of a source's messages has sequence numbers of its own."""
         self._taken: dict[tuple[str, int, int], tuple[int | None, int | None]] = {}
-        self._held: dict[int, Tracks] = {}
+        self._held: dict[int, TrackMessage] = {}
         for arrival, message in enumerate(messages):
             self._note(message, arrival, None)
-            if isinstance(message, Tracks):
+            if isinstance(message, TrackMessage):
                 self._held[arrival] = message
         self._close()
 
@@ -177,7 +176,7 @@ class Logbook:
         book._close()
         return book
 
-    def tracks(self, wanted: Callable[[str, str], bool] = lambda kind, name: True) -> Iterator[Tracks]:
+    def tracks(self, wanted: Callable[[str, str], bool] = lambda kind, name: True) -> Iterator[TrackMessage]:
         """Tracks of the sources ("local") and centres ("global") that are `wanted`, in the order of their places."""
         order, kept = self._order(wanted)
         if self.path is None:
@@ -223,7 +222,7 @@ class Logbook:
                 return f"its tracks have no z (their space: {' '.join(space)})"
         return None
 
-    def ground(self) -> tuple[Frame, tuple[str, ...]] | None:
+    def default_space(self) -> tuple[Frame, tuple[str, ...]] | None:
         """The frame and space of the first source in the alphabet; None without tracks of a source."""
         for name in self.sources:
             space, frame = min(self._spaces[name], key=repr)
@@ -280,7 +279,7 @@ class Logbook:
             account.status = max(known_status, message, key=lambda one: (one.epoch, one.seq))
 
     def _note_traffic(
-        self, kind: str, message: Tracks | LocalIntensity, size: int, arrival: int, received: int | None
+        self, kind: str, message: TrackMessage | LocalIntensity, size: int, arrival: int, received: int | None
     ) -> None:
         name = message.source
         actor = self._actors.setdefault((kind, name), len(self._actors))
@@ -296,7 +295,7 @@ class Logbook:
         if received is not None and kind != "global":
             _remember(self._came, (name, message.epoch, message.seq), received)
 
-    def _note_tracks(self, message: Tracks, arrival: int, received: int | None) -> None:
+    def _note_tracks(self, message: TrackMessage, arrival: int, received: int | None) -> None:
         kind, name = "local" if isinstance(message, LocalTracks) else "global", message.source
         self._note_traffic(kind, message, len(message.ids), arrival, received)
         at = [message.space.index(axis) for axis in "xyz" if axis in message.space]
@@ -380,7 +379,7 @@ class Logbook:
         self._delays, self._came, self._infos_came, self._taken = {}, {}, {}, {}
 
 
-def _by_a_clock(message: Tracks | LocalIntensity) -> bool:
+def _by_a_clock(message: TrackMessage | LocalIntensity) -> bool:
     """Whether `sent` is of a clock: a centre that only replays a mission has none, and says the time of the step."""
     return not (isinstance(message, GlobalTracks) and message.sent == message.time)
 
@@ -407,7 +406,7 @@ def _fill(traffic: Traffic, time: Times, epoch: NDArray[np.uint64], seq: Times, 
     traffic.silences = tuple(Silence(int(times[at]), int(times[at + 1])) for at in longest.tolist())
 
 
-def _latency(delays: Floats) -> Latency:
+def _latency(delays: FloatArray) -> Latency:
     median, p95 = np.quantile(delays, (0.5, 0.95)).tolist()
     top = max(float(np.quantile(delays, 0.99)), float(delays.min()) + 1e-6)
     counts, edges = np.histogram(np.minimum(delays, top), bins=BINS)

@@ -18,7 +18,7 @@ from fusion_service.review.evaluation.results import facts, label, rows_of, rule
 from fusion_service.review.evaluation.tables import (
     DELAYS,
     NUMBERS,
-    Row,
+    ScoredCentre,
     best_rows,
     comparison,
     confirm_line,
@@ -118,7 +118,7 @@ def _left(k: int, left: int) -> str:
     return ' class="left"' if 0 < k < left else ""
 
 
-def _rules(rows: Sequence[Row]) -> str:
+def _rules(rows: Sequence[ScoredCentre]) -> str:
     head, *lines = rules_table(rows)
     best = best_rows(rows)
     marks = {(index, k): "best" for k, name in enumerate(head) for index in best.get(name, ())}
@@ -144,7 +144,7 @@ def _map(one: Assessment) -> list[str]:
     ]
 
 
-def _against_truth(rows: Sequence[Row]) -> list[str]:
+def _against_truth(rows: Sequence[ScoredCentre]) -> list[str]:
     """Of the rows of one recording."""
     evaluation = rows[0].evaluation
     fused = {

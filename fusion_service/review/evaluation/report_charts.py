@@ -23,9 +23,10 @@ from fusion_service.colours import (
     VERMILION,
     source_colours,
 )
+from fusion_service.linalg import FloatArray
 from fusion_service.review.evaluation.logbook import BINS
 from fusion_service.review.evaluation.scoring import WINDOW, Scores
-from fusion_service.review.evaluation.tables import Row, row_name
+from fusion_service.review.evaluation.tables import ScoredCentre, row_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -34,7 +35,6 @@ if TYPE_CHECKING:
 
 __all__ = ["charts", "delay_chart"]
 
-Floats = NDArray[np.float64]
 
 POINTS = 500
 """Points of a line, at most: means over equal parts of the mission where there are more times."""
@@ -61,7 +61,7 @@ STYLE: Any = {
 }
 
 
-def charts(rows: Sequence[Row]) -> list[tuple[str, str]]:
+def charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
     """(SVG, what it shows and how to read it) of scored rows, which must not be none: of one row with its sources, of
     several beside each other. Without a centre: of its sources alone."""
     first = rows[0]
@@ -140,11 +140,11 @@ def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str)
     return _chart(draw, title)
 
 
-def _of(rows: Sequence[Row]) -> str:
+def _of(rows: Sequence[ScoredCentre]) -> str:
     return f" ({rows[0].rule})" if len(rows) > 1 else ""
 
 
-def _lines(rows: Sequence[Row]) -> list[tuple[str, str, float, Scores, Floats]]:
+def _lines(rows: Sequence[ScoredCentre]) -> list[tuple[str, str, float, Scores, FloatArray]]:
     """(name, colour, width, scores, seconds) of the lines of a chart."""
     first = rows[0].evaluation
     if len(rows) == 1:
@@ -161,12 +161,12 @@ def _lines(rows: Sequence[Row]) -> list[tuple[str, str, float, Scores, Floats]]:
     ]
 
 
-def _seconds(times: NDArray[np.int64]) -> Floats:
-    seconds: Floats = (times - times[0]) / 1e9
+def _seconds(times: NDArray[np.int64]) -> FloatArray:
+    seconds: FloatArray = (times - times[0]) / 1e9
     return seconds
 
 
-def _thin(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
+def _thin(seconds: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means over parts of the mission, so that a line has `POINTS` at most."""
     if len(seconds) <= POINTS:
         return seconds, values
@@ -177,7 +177,7 @@ def _thin(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
     return np.bincount(part, seconds, POINTS) / np.bincount(part, minlength=POINTS), mean
 
 
-def _parts(axes: Axes, row: Row) -> None:
+def _parts(axes: Axes, row: ScoredCentre) -> None:
     series, seconds = row.evaluation.fused.series, _seconds(row.evaluation.times)
     power = 3 * int(np.floor(np.log10(max(float((series.gospa**2).max()), 1.0)) / 3))
     layers = [_thin(seconds, getattr(series, name))[1] / 10**power for name in PARTS]
@@ -187,7 +187,7 @@ def _parts(axes: Axes, row: Row) -> None:
     _legend(axes)
 
 
-def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]], what: str, unit: str) -> None:
+def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, FloatArray]], what: str, unit: str) -> None:
     for name, colour, width, scores, seconds in lines:
         values = getattr(scores.series, what)
         if what == "ospa2":
@@ -197,7 +197,7 @@ def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats
     _legend(axes)
 
 
-def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]]) -> None:
+def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, FloatArray]]) -> None:
     _, _, _, fused, seconds = lines[-1] if lines[-1][0].startswith("fused") else lines[0]
     x, low = _thin(seconds, fused.series.low)
     axes.fill_between(x, low, _thin(seconds, fused.series.high)[1], color=GREEN, alpha=0.18, lw=0, label="95 %")
@@ -210,7 +210,7 @@ def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]]) -
     _legend(axes)
 
 
-def _cardinality(axes: Axes, rows: Sequence[Row]) -> None:
+def _cardinality(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
     first = rows[0].evaluation
     seconds = _seconds(first.times)
     axes.plot(*_thin(seconds, first.exists.sum(axis=1).astype(float)), color=PAPER_TRUTH, lw=4, alpha=0.6, label="true")
@@ -225,7 +225,7 @@ def _cardinality(axes: Axes, rows: Sequence[Row]) -> None:
     _legend(axes)
 
 
-def _siap(axes: Axes, row: Row) -> None:
+def _siap(axes: Axes, row: ScoredCentre) -> None:
     series, seconds = row.evaluation.fused.series, _seconds(row.evaluation.times)
     for name, label, colour in (
         ("completeness", "complete", GREEN),
@@ -237,7 +237,7 @@ def _siap(axes: Axes, row: Row) -> None:
     _legend(axes)
 
 
-def _confirm(axes: Axes, rows: Sequence[Row]) -> None:
+def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
     palette = (PAPER_FUSED, *SOURCES)
     for k, row in enumerate(rows):
         known = int((row.evaluation.begins >= 0).sum())

@@ -11,7 +11,7 @@ from fusion_service.review.evaluation.assess import Assessment
 from fusion_service.review.evaluation.scoring import plain
 from fusion_service.review.evaluation.tables import (
     NUMBERS,
-    Row,
+    ScoredCentre,
     aligned,
     comparison,
     confirm_line,
@@ -32,10 +32,10 @@ def rule_of(assessment: Assessment, centre: str) -> str:
     return named[0][0] if named else "no centre"
 
 
-def rows_of(assessments: Sequence[Assessment]) -> list[Row]:
+def rows_of(assessments: Sequence[Assessment]) -> list[ScoredCentre]:
     """A row for each centre that could be scored."""
     return [
-        Row(label(one), centre, rule_of(one, centre), evaluation)
+        ScoredCentre(label(one), centre, rule_of(one, centre), evaluation)
         for one in assessments
         for centre, evaluation in one.evaluations.items()
     ]

@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
+from fusion_service.linalg import FloatArray
 from fusion_service.metrics import DENSE, assign_near, near_pairs, nees, nees_bounds
-from fusion_service.review.evaluation.continuity import Following, Moment, Siap, ospa2, siap_of
-from fusion_service.review.snapshots import Block
+from fusion_service.review.evaluation.continuity import Following, Instant, Siap, ospa2, siap_of
+from fusion_service.review.snapshots import Block, Times
 
 __all__ = ["METRICS", "WINDOW", "P", "Scores", "Series", "Tally", "averages", "bounds", "plain"]
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
-Ints = NDArray[np.int64]
 
 METRICS = (
     "gospa",
@@ -49,23 +47,23 @@ class Series:
     probabilities expect (NaN where it says none); SIAP's completeness, ambiguity, spuriousness.
     ospa2: at the times with the indices `windows`."""
 
-    gospa: Floats
-    localisation: Floats
-    missed: Floats
-    false: Floats
-    ospa: Floats
-    rmse: Floats
-    anees: Floats
-    low: Floats
-    high: Floats
-    pairs: Ints
-    shown: Ints
-    expected: Floats
-    completeness: Floats
-    ambiguity: Floats
-    spuriousness: Floats
-    windows: Ints
-    ospa2: Floats
+    gospa: FloatArray
+    localisation: FloatArray
+    missed: FloatArray
+    false: FloatArray
+    ospa: FloatArray
+    rmse: FloatArray
+    anees: FloatArray
+    low: FloatArray
+    high: FloatArray
+    pairs: NDArray[np.int64]
+    shown: NDArray[np.int64]
+    expected: FloatArray
+    completeness: FloatArray
+    ambiguity: FloatArray
+    spuriousness: FloatArray
+    windows: NDArray[np.int64]
+    ospa2: FloatArray
 
     def as_json(self) -> dict[str, list[Any]]:
         """Rounded to six digits, None for what does not exist."""
@@ -91,8 +89,8 @@ class Scores:
     anees: float
     identity_switches: int
     bounds: tuple[float, float]
-    errors: Floats
-    nees: Floats
+    errors: FloatArray
+    nees: FloatArray
     rmse_velocity: float
     ospa: float
     ospa2: float
@@ -121,7 +119,7 @@ class Tally:
     times (K,); truth (K, T, m): position, and then velocity, NaN where it is not known or a target does not exist.
     """
 
-    def __init__(self, times: Times, truth: Floats, d: int, c: float) -> None:
+    def __init__(self, times: Times, truth: FloatArray, d: int, c: float) -> None:
         count, targets = truth.shape[:2]
         self._times, self._truth, self._d, self._c = times, truth, d, c
         self._parts = np.zeros((count, 3))
@@ -139,7 +137,7 @@ class Tally:
         self._tracks = np.zeros(0, dtype=np.bool_)
         """By the number of a track: whether it was ever shown."""
         self._following = Following(targets)
-        self._window: deque[Moment] = deque(maxlen=WINDOW)
+        self._window: deque[Instant] = deque(maxlen=WINDOW)
         self._stride = max(1, count // WINDOWS)
         self._windows: list[tuple[int, float]] = []
 
@@ -166,7 +164,7 @@ class Tally:
         self._following.add(k, there[rows], number[columns])
         from_end = len(self._times) - 1 - k
         if from_end % self._stride < WINDOW:
-            self._window.append(Moment(there, number, there[i], number[j], apart))
+            self._window.append(Instant(there, number, there[i], number[j], apart))
             if from_end % self._stride == 0:
                 self._windows.append((k, ospa2(self._window, c, P)))
         if from_end % self._stride == 0 and self._stride >= WINDOW:
@@ -183,7 +181,7 @@ class Tally:
         targets: NDArray[np.intp],
         rows: NDArray[np.intp],
         tracks: NDArray[np.intp],
-        apart: Floats,
+        apart: FloatArray,
         objects: int,
         shown: int,
         block: Block,
@@ -277,7 +275,7 @@ class Tally:
         )
 
 
-def averages(errors: Floats, squared: Floats) -> tuple[float, float]:
+def averages(errors: FloatArray, squared: FloatArray) -> tuple[float, float]:
     """RMSE and ANEES of pairs (R,), (R,); NaN without a pair."""
     return (float(np.sqrt(np.mean(errors**2))), float(np.mean(squared))) if len(errors) else (np.nan, np.nan)
 
@@ -294,7 +292,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _lengths(rows: Floats) -> Floats:
+def _lengths(rows: FloatArray) -> FloatArray:
     """(R, m) -> (R,), NaN where m is 0."""
     return np.sqrt((rows * rows).sum(axis=1)) if rows.shape[1] else np.full(len(rows), np.nan)
 

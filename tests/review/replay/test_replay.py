@@ -400,7 +400,7 @@ def test_little_is_held_however_long_the_mission(tmp_path: Path) -> None:
     assert replay.passed
     assert replay.verdict is not None
     assert replay.verdict.compared == 90
-    assert replay.most_held <= 3 * (8 + 1) + 3 * 2
+    assert replay.most_buffered <= 3 * (8 + 1) + 3 * 2
 
 
 def test_mistakes_are_told_before_anything_is_written(mission: Path, tmp_path: Path, capsys: Any) -> None:

@@ -13,7 +13,7 @@ from scipy.stats import binomtest, chi2
 
 from fusion_service.recording import Recorder
 from fusion_service.recording.columns import Stamp
-from fusion_service.recording.drawing.errors import Assessment, Score
+from fusion_service.recording.drawing.errors import StepErrors, TruthMatcher
 from schemas import Message, encode, global_key, local_key
 from tests.helpers import missions
 from tests.recording.contents import entities, key_of, record, row, rows, texts
@@ -52,8 +52,8 @@ def test_a_consistent_centre_stays_within_the_bounds(flown: tuple[Path, list[Sen
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(SIGMA * math.sqrt(2), rel=0.1)
 
 
-def scores(*said: Message, cutoff: float | None = None) -> list[Score]:
-    assessment, found = Assessment(cutoff), []
+def scores(*said: Message, cutoff: float | None = None) -> list[StepErrors]:
+    assessment, found = TruthMatcher(cutoff), []
     for message in said:
         if message.type == "truth":
             assessment.truth(message)  # type: ignore[arg-type]
