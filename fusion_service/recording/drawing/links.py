@@ -13,10 +13,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.linalg import FloatArray
+from fusion_service.recording.columns import entity
 from fusion_service.recording.drawing.tables import Table
 from schemas import GlobalTracks
 
-__all__ = ["links"]
+__all__ = ["links", "links_path"]
+
+
+def links_path(centre: str, source: str) -> str:
+    """The entity of the lines from the tracks of `source` to those of `centre`."""
+    return entity("picture", "global", centre, "links", source)
 
 
 def links(

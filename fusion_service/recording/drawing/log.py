@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service.recording.columns import ColumnWriter, Stamp, documents, entity, texts
-from fusion_service.recording.drawing.drawing import Drawing
+from fusion_service.recording.drawing.tracks import Drawing
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import DECISIONS, KEPT, NO_SOURCE
 

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from fusion_service import geodesy
 from fusion_service.recording.columns import ColumnWriter, Stamp
 from fusion_service.recording.drawing.charts import Charts
-from fusion_service.recording.drawing.drawing import Drawing
 from fusion_service.recording.drawing.errors import TruthMatcher
 from fusion_service.recording.drawing.log import EventLog
+from fusion_service.recording.drawing.tracks import Drawing
 from schemas import (
     FAULTS,
     Frame,

@@ -6,8 +6,9 @@ one of `LEVELS` opacities and as a width; what is tentative is fainter.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,10 +17,11 @@ from fusion_service.linalg import FloatArray
 from fusion_service.recording.drawing.geometry import Place
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks
 
-__all__ = ["COASTING", "LEVELS", "Table", "drawn_components", "hold", "levels", "tabulate"]
+__all__ = ["COASTING", "LEVELS", "Table", "drawn_components", "hold", "levels", "remember", "tabulate"]
 
 U64 = NDArray[np.uint64]
 Codes = NDArray[np.uint8]
+T = TypeVar("T")
 
 TENTATIVE, COASTING = STATUSES.index("tentative"), STATUSES.index("coasting")
 LEVELS = 16
@@ -28,6 +30,9 @@ FAINTER = np.array([0.35, 1.0, 0.67])
 LIGHT = 0.01
 MAX_COMPONENTS = 2000
 """Components that weigh less than `LIGHT`, and of one message all but the heaviest, are not drawn."""
+TOLD, TOLD_TRACKS = 64, 5000
+"""Newest messages of a source, and tracks in them, among which that is sought which a step could know: in a fast
+playback the sources are far ahead of the centre."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -110,3 +115,11 @@ def levels(table: Table) -> NDArray[np.uint16]:
     mass: FloatArray = np.minimum(np.nan_to_num(table.mass), 1.0) * FAINTER[table.codes]
     level: NDArray[np.uint16] = np.rint((LEVELS - 1) * np.maximum(mass, 0.0)).astype(np.uint16)
     return level
+
+
+def remember(told: deque[T], item: T, tracks: int) -> None:
+    """Add `item`, and drop the oldest so that at most `TOLD` stay, and no more than `TOLD_TRACKS` if all have `tracks`
+    tracks."""
+    told.append(item)
+    while len(told) > max(1, min(TOLD, TOLD_TRACKS // max(tracks, 1))):
+        told.popleft()
