@@ -24,14 +24,14 @@ from fusion_service.colours import (
     source_colours,
 )
 from fusion_service.linalg import FloatArray
-from fusion_service.review.evaluation.logbook import BINS
+from fusion_service.review.evaluation.latency import BINS
 from fusion_service.review.evaluation.scoring import WINDOW, Scores
-from fusion_service.review.evaluation.tables import ScoredCentre, row_name
+from fusion_service.review.evaluation.tables import ScoredCentre, power_of_ten, row_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from fusion_service.review.evaluation.logbook import Latency
+    from fusion_service.review.evaluation.latency import Latency
 
 __all__ = ["charts", "delay_chart"]
 
@@ -39,8 +39,9 @@ __all__ = ["charts", "delay_chart"]
 POINTS = 500
 """Points of a line, at most: means over equal parts of the mission where there are more times."""
 SIZE = (5.0, 3.0)
-RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 PARTS = {"localisation": SKY, "missed": ORANGE, "false": VERMILION}
+Line = tuple[str, str, float, Scores, FloatArray]
+"""Name, colour, width, scores, and seconds (K,) since the first scored time."""
 STYLE: Any = {
     "svg.fonttype": "none",
     "text.parse_math": False,
@@ -64,64 +65,67 @@ STYLE: Any = {
 def charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
     """(SVG, what it shows and how to read it) of scored rows, which must not be none: of one row with its sources, of
     several beside each other. Without a centre: of its sources alone."""
-    first = rows[0]
     lines = _lines(rows)
     if not lines:
         return []
-    fused = first.evaluation.centre is not None
-    beside = "the fused tracks of each row" if len(rows) > 1 else "each source and the fused tracks"
-    found = []
-
-    def put(draw: Callable[[Axes], None], title: str, text: str) -> None:
-        found.append((_chart(draw, title), text))
-
+    fused = rows[0].evaluation.centre is not None
+    found = [_parts_chart(rows)] if fused else []
+    found += _error_charts(rows, lines)
     if fused:
-        put(
-            lambda axes: _parts(axes, first),
-            f"GOSPA², its parts{_of(rows)}",
-            "Its parts: errors of position, targets missed, false tracks. The tallest layer is what to mend.",
+        found += _number_charts(rows)
+    found.append(
+        (
+            _chart(lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"), "OSPA(2): tracks, not points"),
+            f"Compares whole tracks over {WINDOW} scored times: a track that changes its target or breaks costs too. "
+            "Lower is better.",
         )
-    put(
-        lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"),
-        "GOSPA over time",
-        f"All faults in one number for {beside}. Lower is better.",
-    )
-    put(
-        lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"),
-        "Error of position over time",
-        "Only of targets that are followed at that time: a source that follows only easy ones looks good here.",
-    )
-    put(
-        lambda axes: _nees(axes, lines),
-        "Consistency: ANEES over time",
-        "1 is ideal. Above the band the covariances are too small (overconfident), below it too large (cautious).",
-    )
-    if fused:
-        put(
-            lambda axes: _cardinality(axes, rows),
-            "How many there are",
-            "Targets that exist, and fused tracks that are shown. Shown below true: missed; above: false or double. "
-            "Expected: the sum of existence probabilities, tentative tracks included.",
-        )
-        put(
-            lambda axes: _siap(axes, first),
-            f"SIAP of the fused tracks{_of(rows)}",
-            "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per "
-            "target that has one: 1 is ideal.",
-        )
-    put(
-        lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"),
-        "OSPA(2): tracks, not points",
-        f"Compares whole tracks over {WINDOW} scored times: a track that changes its target or breaks costs too. "
-        "Lower is better.",
     )
     if any(np.isfinite(row.evaluation.confirm).any() for row in rows):
-        put(
-            lambda axes: _confirm(axes, rows),
-            "Time to confirm",
-            "Share of the targets that a source covered or tracked which had a fused track after so many seconds.",
-        )
+        text = "Share of the targets that a source covered or tracked which had a fused track after so many seconds."
+        found.append((_chart(lambda axes: _confirm(axes, rows), "Time to confirm"), text))
     return found
+
+
+def _parts_chart(rows: Sequence[ScoredCentre]) -> tuple[str, str]:
+    return (
+        _chart(lambda axes: _parts(axes, rows[0]), f"GOSPA², its parts{_of(rows)}"),
+        "Its parts: errors of position, targets missed, false tracks. The tallest layer is what to mend.",
+    )
+
+
+def _error_charts(rows: Sequence[ScoredCentre], lines: Sequence[Line]) -> list[tuple[str, str]]:
+    """GOSPA, RMSE and ANEES over time."""
+    beside = "the fused tracks of each row" if len(rows) > 1 else "each source and the fused tracks"
+    return [
+        (
+            _chart(lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"), "GOSPA over time"),
+            f"All faults in one number for {beside}. Lower is better.",
+        ),
+        (
+            _chart(lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"), "Error of position over time"),
+            "Only of targets that are followed at that time: a source that follows only easy ones looks good here.",
+        ),
+        (
+            _chart(lambda axes: _nees(axes, lines), "Consistency: ANEES over time"),
+            "1 is ideal. Above the band the covariances are too small (overconfident), below it too large (cautious).",
+        ),
+    ]
+
+
+def _number_charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
+    """How many fused tracks there are, and how many of them are right."""
+    return [
+        (
+            _chart(lambda axes: _cardinality(axes, rows), "How many there are"),
+            "Targets that exist, and fused tracks that are shown. Shown below true: missed; above: false or double. "
+            "Expected: the sum of existence probabilities, tentative tracks included.",
+        ),
+        (
+            _chart(lambda axes: _siap(axes, rows[0]), f"SIAP of the fused tracks{_of(rows)}"),
+            "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per "
+            "target that has one: 1 is ideal.",
+        ),
+    ]
 
 
 def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str) -> str:
@@ -144,8 +148,8 @@ def _of(rows: Sequence[ScoredCentre]) -> str:
     return f" ({rows[0].rule})" if len(rows) > 1 else ""
 
 
-def _lines(rows: Sequence[ScoredCentre]) -> list[tuple[str, str, float, Scores, FloatArray]]:
-    """(name, colour, width, scores, seconds) of the lines of a chart."""
+def _lines(rows: Sequence[ScoredCentre]) -> list[Line]:
+    """Of a chart over time: of one row its sources and fused tracks, else the fused tracks of each."""
     first = rows[0].evaluation
     if len(rows) == 1:
         colours = source_colours(first.sources)
@@ -154,9 +158,9 @@ def _lines(rows: Sequence[ScoredCentre]) -> list[tuple[str, str, float, Scores, 
         if first.centre is None:
             return lines
         return [*lines, (f"fused, {rows[0].rule}", PAPER_FUSED, 2.0, first.fused, seconds)]
-    palette = (PAPER_FUSED, *SOURCES)
+    tones = (PAPER_FUSED, *SOURCES)
     return [
-        (row_name(row, rows), palette[k % len(palette)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
+        (row_name(row, rows), tones[k % len(tones)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
         for k, row in enumerate(rows)
     ]
 
@@ -182,12 +186,12 @@ def _parts(axes: Axes, row: ScoredCentre) -> None:
     power = 3 * int(np.floor(np.log10(max(float((series.gospa**2).max()), 1.0)) / 3))
     layers = [_thin(seconds, getattr(series, name))[1] / 10**power for name in PARTS]
     axes.stackplot(_thin(seconds, series.gospa)[0], *layers, labels=list(PARTS), colors=list(PARTS.values()), lw=0)
-    unit = f"10{str(power).translate(RAISED)} m²" if power else "m²"
+    unit = f"{power_of_ten(power)} m²" if power else "m²"
     axes.set(xlabel="s since the first scored time", ylabel=unit, ylim=(0, None))
     _legend(axes)
 
 
-def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, FloatArray]], what: str, unit: str) -> None:
+def _over_time(axes: Axes, lines: Sequence[Line], what: str, unit: str) -> None:
     for name, colour, width, scores, seconds in lines:
         values = getattr(scores.series, what)
         if what == "ospa2":
@@ -197,7 +201,7 @@ def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, FloatA
     _legend(axes)
 
 
-def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, FloatArray]]) -> None:
+def _nees(axes: Axes, lines: Sequence[Line]) -> None:
     _, _, _, fused, seconds = lines[-1] if lines[-1][0].startswith("fused") else lines[0]
     x, low = _thin(seconds, fused.series.low)
     axes.fill_between(x, low, _thin(seconds, fused.series.high)[1], color=GREEN, alpha=0.18, lw=0, label="95 %")
@@ -238,7 +242,7 @@ def _siap(axes: Axes, row: ScoredCentre) -> None:
 
 
 def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
-    palette = (PAPER_FUSED, *SOURCES)
+    tones = (PAPER_FUSED, *SOURCES)
     for k, row in enumerate(rows):
         known = int((row.evaluation.begins >= 0).sum())
         after = np.sort(row.evaluation.confirm[np.isfinite(row.evaluation.confirm)])
@@ -246,7 +250,7 @@ def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
             continue
         x, y = np.append(after, after[-1] * 1.08 + 1), np.append(np.arange(1, len(after) + 1), len(after))
         label = row_name(row, rows) if len(rows) > 1 else None
-        axes.step([0, *x], [0, *(100 * y / known)], where="post", color=palette[k % len(palette)], label=label)
+        axes.step([0, *x], [0, *(100 * y / known)], where="post", color=tones[k % len(tones)], label=label)
     axes.set(xlabel="s since it could be known", ylabel="targets confirmed, %", ylim=(0, 104), xlim=(0, None))
     if len(rows) > 1:
         _legend(axes)

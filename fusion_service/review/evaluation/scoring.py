@@ -208,70 +208,78 @@ class Tally:
 
     def scores(self) -> Scores:
         """When all times are added."""
-        errors, squared, d = self._errors, self._nees, self._d
-        pairs = np.isfinite(errors)
-        exists = np.isfinite(self._truth[:, :, 0])
+        errors, squared = self._errors, self._nees
+        pairs, exists = np.isfinite(errors), np.isfinite(self._truth[:, :, 0])
+        series = self._series(pairs, exists)
         localisation, missed, false = self._parts.T
-        gospa = self._parts.sum(axis=1) ** (1 / P)
         rmse, anees = averages(errors[pairs], squared[pairs])
-        counts = pairs.sum(axis=1)
-        objects, tracked, assigned = exists.sum(axis=1), self._siap[:, 0], self._siap[:, 1]
         with np.errstate(invalid="ignore", divide="ignore"):
-            over_time = np.sqrt(np.nansum(errors**2, axis=1) / counts)
-            consistent = np.nansum(squared, axis=1) / counts
-            accuracy = self._sums[[0, 2]] / self._sums[[1, 3]]
             velocity = np.sqrt(self._velocity[0] / self._velocity[1])
-            low, high = (2 * gammaincinv(d * counts / 2, q) / (d * counts) for q in (0.025, 0.975))
-            share = [tracked / objects, assigned / tracked, 1 - assigned / self._shown]
-        life = np.zeros(0)
-        if len(exists):
-            some = exists[:, exists.any(axis=0)]
-            life = (self._times[len(some) - 1 - some[::-1].argmax(axis=0)] - self._times[some.argmax(axis=0)]) / 1e9
-        sums = (float(objects.sum()), float(tracked.sum()), float(self._shown.sum()), float(assigned.sum()))
-        windows = np.array([k for k, _ in self._windows], dtype=np.int64)
-        tracks2 = np.array([value for _, value in self._windows])
         return Scores(
-            gospa=float(gospa.mean()),
+            gospa=float(series.gospa.mean()),
             gospa_localisation=float(localisation.mean()),
             gospa_missed=float(missed.mean()),
             gospa_false=float(false.mean()),
             rmse_position=rmse,
             anees=anees,
             identity_switches=self._switches,
-            bounds=bounds(d, int(pairs.sum())),
+            bounds=bounds(self._d, int(pairs.sum())),
             errors=errors,
             nees=squared,
             rmse_velocity=float(velocity),
             ospa=float(self._ospa.mean()),
-            ospa2=float(tracks2.mean()),
+            ospa2=float(series.ospa2.mean()),
             followed=int((pairs.sum(axis=0) >= np.maximum(HALF * exists.sum(axis=0), 1)).sum()),
             tracks=int(self._tracks.sum()),
-            siap=siap_of(
-                self._following.segments(len(self._times) - 1),
-                self._times,
-                life,
-                sums,
-                (float(accuracy[0]), float(accuracy[1])),
-            ),
-            series=Series(
-                gospa=gospa,
-                localisation=localisation,
-                missed=missed,
-                false=false,
-                ospa=self._ospa,
-                rmse=over_time,
-                anees=consistent,
-                low=low,
-                high=high,
-                pairs=counts,
-                shown=self._shown,
-                expected=self._expected,
-                completeness=share[0],
-                ambiguity=share[1],
-                spuriousness=share[2],
-                windows=windows,
-                ospa2=tracks2,
-            ),
+            siap=self._siap_of(exists),
+            series=series,
+        )
+
+    def _series(self, pairs: NDArray[np.bool_], exists: NDArray[np.bool_]) -> Series:
+        """pairs (K, T): where a track is assigned; exists (K, T): where a target is."""
+        counts, d = pairs.sum(axis=1), self._d
+        objects, tracked, assigned = exists.sum(axis=1), self._siap[:, 0], self._siap[:, 1]
+        localisation, missed, false = self._parts.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            over_time = np.sqrt(np.nansum(self._errors**2, axis=1) / counts)
+            consistent = np.nansum(self._nees, axis=1) / counts
+            low, high = (2 * gammaincinv(d * counts / 2, q) / (d * counts) for q in (0.025, 0.975))
+            share = [tracked / objects, assigned / tracked, 1 - assigned / self._shown]
+        return Series(
+            gospa=self._parts.sum(axis=1) ** (1 / P),
+            localisation=localisation,
+            missed=missed,
+            false=false,
+            ospa=self._ospa,
+            rmse=over_time,
+            anees=consistent,
+            low=low,
+            high=high,
+            pairs=counts,
+            shown=self._shown,
+            expected=self._expected,
+            completeness=share[0],
+            ambiguity=share[1],
+            spuriousness=share[2],
+            windows=np.array([k for k, _ in self._windows], dtype=np.int64),
+            ospa2=np.array([value for _, value in self._windows]),
+        )
+
+    def _siap_of(self, exists: NDArray[np.bool_]) -> Siap:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            accuracy = self._sums[[0, 2]] / self._sums[[1, 3]]
+        life = np.zeros(0)
+        if len(exists):
+            some = exists[:, exists.any(axis=0)]
+            life = (self._times[len(some) - 1 - some[::-1].argmax(axis=0)] - self._times[some.argmax(axis=0)]) / 1e9
+        counts = (exists.sum(), self._siap[:, 0].sum(), self._shown.sum(), self._siap[:, 1].sum())
+        objects, tracked, shown, assigned = map(float, counts)
+        return siap_of(
+            self._following.segments(len(self._times) - 1),
+            self._times,
+            life,
+            (objects, tracked, shown, assigned),
+            (float(accuracy[0]), float(accuracy[1])),
         )
 
 

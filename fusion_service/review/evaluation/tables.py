@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
+    from fusion_service.review.evaluation.account import Account
     from fusion_service.review.evaluation.assess import Assessment, Evaluation
     from fusion_service.review.evaluation.consistency import SourcePair
-    from fusion_service.review.evaluation.logbook import Account
     from fusion_service.review.evaluation.scoring import Scores
 
 __all__ = [
@@ -30,12 +30,15 @@ __all__ = [
     "metres",
     "pair_words",
     "percent",
+    "power_of_ten",
     "row_name",
     "rules_table",
     "sentence",
     "tracking_table",
     "truthless_lines",
 ]
+
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def format_table(evaluation: Evaluation) -> str:
@@ -365,3 +368,8 @@ def _sources(n: int) -> str:
 def percent(share: float) -> str:
     """0.05 as 5 %."""
     return f"{100 * share:.3g} %" if np.isfinite(share) else "-"
+
+
+def power_of_ten(power: int) -> str:
+    """10 with its power raised: 10⁶."""
+    return f"10{str(power).translate(RAISED)}"
