@@ -332,7 +332,7 @@ def test_nothing_to_score(mission: list[Message], says: str) -> None:
 
 
 def test_a_wrong_clock_does_not_ask_for_a_billion_times() -> None:
-    far = [truth(0, [1], STILL), truth(1e9, [1], STILL), picture(0, [1], STILL)]
+    far: list[Message] = [truth(0, [1], STILL), truth(1e9, [1], STILL), picture(0, [1], STILL)]
     with pytest.raises(ValueError, match=r"1000000000 times every 1 s: a clock is wrong, or every"):
         evaluate(far, c=10.0, every=1.0)
 

@@ -23,8 +23,8 @@ from schemas import GlobalTracks, LocalTracks, StepLog
 from tests.centre.worlds import FRAME, SECOND, SPACE, START, info, moved, seen, tracks, truth
 from tests.helpers import flown
 from tests.helpers.flown import REALM, Flight, edited, messy, raws, record
-from tests.helpers.processes import Hub, eventually
-from tests.helpers.scene import COMMAND, Program, opened
+from tests.helpers.processes import Hub, Program, eventually
+from tests.helpers.scene import COMMAND, opened
 from tests.recording.contents import entities
 
 OPTIONS: dict[str, dict[str, Any]] = {
