@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import Enu, GlobalTracks, LocalTracks, Motion, SensorInfo, Truth
+from schemas import Enu, GlobalTracks, LocalTracks, Message, Motion, SensorInfo, Truth
 
 Array = NDArray[np.float64]
 Places = Sequence[Sequence[float]] | Array
@@ -18,6 +18,7 @@ SECOND = 10**9
 START = 1_700_000_000 * SECOND
 FRAME = Enu(60.0, 10.0)
 SPACE = ("x", "vx", "y", "vy")
+STILL = [[0.0, 0.0]]
 
 
 def at(seconds: float) -> int:
@@ -95,3 +96,9 @@ def picture(
         contributor_influence=np.zeros(0),
         **given,
     )
+
+
+def still(seconds: int) -> list[Message]:
+    """One object at rest at the origin, and a centre that sees it perfectly, every second."""
+    times = range(seconds + 1)
+    return [*(truth(t, [1], STILL) for t in times), *(picture(t, [1], STILL) for t in times)]
