@@ -15,7 +15,6 @@ __all__ = [
     "ORANGE",
     "PAPER_FUSED",
     "PAPER_TRUTH",
-    "SCREEN_CENTRES",
     "SCREEN_FUSED",
     "SCREEN_GRID",
     "SCREEN_NEUTRAL",

@@ -31,7 +31,6 @@ __all__ = [
     "entity",
     "import_rerun",
     "raw",
-    "scalars",
     "texts",
     "weight",
 ]
@@ -106,9 +105,11 @@ class Row(NamedTuple):
 class Mirror(Protocol):
     """Who is shown every row and everything static as well."""
 
-    def row(self, row: Row) -> None: ...
+    def row(self, row: Row) -> None:
+        """A row was added."""
 
-    def static(self, path: str, batches: dict[str, Any]) -> None: ...
+    def static(self, path: str, batches: dict[str, Any]) -> None:
+        """The component `batches` of the entity `path`, by name, hold at all times."""
 
 
 class ColumnWriter:
@@ -142,12 +143,15 @@ class ColumnWriter:
                 self._mirror.row(row)
 
     def points(self, path: str, stamp: Stamp, content: Points) -> None:
+        """A row of points, which stands until the next."""
         self.add(path, _points, stamp, content, stands=True)
 
     def lines(self, path: str, stamp: Stamp, content: Lines, *, stands: bool = True) -> None:
+        """A row of line strips."""
         self.add(path, _lines, stamp, content, stands=stands)
 
     def scalar(self, path: str, stamp: Stamp, value: float) -> None:
+        """A point of a time series; NaN breaks the line."""
         self.add(path, scalars, stamp, value)
 
     def static(self, path: str, *archetypes: Any, keep: bool = True) -> None:

@@ -98,6 +98,7 @@ class Live:
             self._statics.setdefault(path, {}).update(batches)
 
     def blueprint(self, blueprint: Any) -> None:
+        """How it opens, from the next `push` on."""
         with self._change:
             self._blueprint = blueprint
 

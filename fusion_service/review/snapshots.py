@@ -30,7 +30,6 @@ __all__ = [
     "Times",
     "TrackMessage",
     "in_frame",
-    "interval",
     "order",
     "truth_path",
     "truth_positions",
@@ -49,11 +48,6 @@ TRUTH_GAPS = 3.0
 def order(message: TrackMessage | Truth) -> tuple[int, int, int]:
     """Sorting key: time, epoch, sequence."""
     return message.time, message.epoch, message.seq
-
-
-def interval(messages: Sequence[TrackMessage | Truth]) -> float:
-    """Median interval between the times of messages, s; 0 for a single one."""
-    return _median_step(np.unique([message.time for message in messages]))
 
 
 def truth_path(

@@ -59,7 +59,7 @@ def scores(*said: Message, cutoff: float | None = None) -> list[StepErrors]:
             matcher.truth(message)  # type: ignore[arg-type]
         else:
             matcher.step(message, Stamp(0, message.time))  # type: ignore[arg-type, union-attr]
-        found += list(matcher.scores())
+        found += list(matcher.matched())
     return found
 
 

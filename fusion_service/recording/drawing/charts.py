@@ -45,7 +45,7 @@ in all. A new part of the recording counts anew."""
 
 
 class Charts:
-    """Turns messages and scores into points of time series, each with its colour and name."""
+    """Turns messages and errors into points of time series, each with its colour and name."""
 
     def __init__(self, columns: ColumnWriter, focus: int | None = None) -> None:
         self._rr = import_rerun()
@@ -67,6 +67,7 @@ class Charts:
         self._series.clear()
 
     def local(self, message: LocalTracks | LocalIntensity, colours: dict[str, Colour], stamp: Stamp) -> None:
+        """How many tracks, or objects expected, a source has."""
         path, name = entity("counts", "local", message.source), message.source
         tone = colours.get(message.source, SCREEN_NEUTRAL)
         if isinstance(message, LocalTracks):
@@ -141,11 +142,11 @@ class Charts:
                 if number in shares or path in self._styles:
                     self._add(path, stamp, shares.get(number, np.nan), tone, name, 2.0)
 
-    def score(self, score: StepErrors, centres: dict[str, Colour]) -> int:
+    def errors(self, found: StepErrors, centres: dict[str, Colour]) -> int:
         """Returns how many targets have no series, because there are enough."""
-        centre, stamp, left_out = score.centre, score.stamp, 0
+        centre, stamp, left_out = found.centre, found.stamp, 0
         own = centres.get(centre, SCREEN_FUSED)
-        for target, error, nees in zip(score.ids.tolist(), score.error.tolist(), score.nees.tolist(), strict=True):
+        for target, error, nees in zip(found.ids.tolist(), found.error.tolist(), found.nees.tolist(), strict=True):
             if target not in self._targets and len(self._targets) >= MAX_SERIES:
                 left_out += 1
                 continue
@@ -153,19 +154,19 @@ class Charts:
             tone, name = _tone(target), f"target {target}"
             self._add(entity("error", centre, str(target)), stamp, error, tone, name)
             self._add(entity("nees", centre, str(target)), stamp, nees, tone, name)
-        single = metrics.nees_bounds(score.dimension, 1)
-        charts = [("nees", single), ("anees", score.bounds)]
+        single = metrics.nees_bounds(found.dimension, 1)
+        charts = [("nees", single), ("anees", found.bounds)]
         for path, (low, high) in charts:
             self._bounds(entity(path, centre, "bounds"), (low, high), stamp)
-        mean = float(np.nanmean(score.nees)) if score.assigned else np.nan
+        mean = float(np.nanmean(found.nees)) if found.assigned else np.nan
         name = "mean NEES" if len(centres) < 2 else f"{centre}: mean NEES"
         self._add(entity("anees", centre, "mean"), stamp, mean, own, name, 2.5)
         if self._focus is not None:
-            for row in np.flatnonzero(score.tracks == np.uint64(self._focus)).tolist():
-                name = f"to target {int(score.ids[row])}"
-                path = entity("track", centre, "error", str(int(score.ids[row])))
-                self._add(path, stamp, float(score.error[row]), own, name, 2.0)
-                self._add(entity("track", centre, "nees", "track"), stamp, float(score.nees[row]), own, "NEES", 2.0)
+            for row in np.flatnonzero(found.tracks == np.uint64(self._focus)).tolist():
+                name = f"to target {int(found.ids[row])}"
+                path = entity("track", centre, "error", str(int(found.ids[row])))
+                self._add(path, stamp, float(found.error[row]), own, name, 2.0)
+                self._add(entity("track", centre, "nees", "track"), stamp, float(found.nees[row]), own, "NEES", 2.0)
                 self._bounds(entity("track", centre, "nees", "bounds"), single, stamp)
         return left_out
 

@@ -48,10 +48,12 @@ class StepErrors(NamedTuple):
 
     @property
     def assigned(self) -> int:
+        """How many true objects have a track."""
         return int(np.isfinite(self.nees).sum())
 
     @property
     def bounds(self) -> tuple[float, float]:
+        """Of the mean NEES over its dimension; NaN where no object has a track."""
         return metrics.nees_bounds(self.dimension, self.assigned) if self.assigned else (np.nan, np.nan)
 
 
@@ -64,6 +66,7 @@ class TruthMatcher:
         self._steps: deque[tuple[GlobalTracks, Stamp]] = deque(maxlen=HELD)
 
     def truth(self, message: Truth) -> None:
+        """Truth, as it comes; a new epoch takes the place of the old one."""
         held = self._truth.setdefault(message.source, [])
         if held and held[-1].epoch != message.epoch:
             held.clear()
@@ -71,12 +74,13 @@ class TruthMatcher:
         del held[:-HELD]
 
     def step(self, message: GlobalTracks, stamp: Stamp) -> None:
+        """A global step, as it comes; its errors are told at `stamp`."""
         self._steps.append((message, stamp))
         held = sum(len(one.ids) for one, _ in self._steps)
         while held > HELD_TRACKS and len(self._steps) > 1:
             held -= len(self._steps.popleft()[0].ids)
 
-    def scores(self) -> Iterator[StepErrors]:
+    def matched(self) -> Iterator[StepErrors]:
         """Every step whose time the truth has reached; the others wait for it. `geodesy.FrameError` where the
         truth has no place in the frame of the tracks: that step is left out."""
         waiting = list(self._steps)

@@ -12,7 +12,7 @@ from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import ColumnWriter, import_rerun
 from fusion_service.recording.drawing.geometry import grid
 
-__all__ = ["Extent"]
+__all__ = ["Corners", "Extent"]
 
 Corners = tuple[FloatArray, FloatArray]
 """South-west and north-east (2,), m."""

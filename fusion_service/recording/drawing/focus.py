@@ -22,12 +22,15 @@ from fusion_service.colours import SCREEN_GRID, SCREEN_NEUTRAL, SCREEN_TRUTH, Co
 from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import Stamp, entity, import_rerun
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
+from fusion_service.recording.drawing.extent import Corners
 from fusion_service.recording.drawing.geometry import RING, rings, track_moments
 from fusion_service.recording.drawing.styles import Styles
 from fusion_service.recording.drawing.tables import Table, remember, tabulate
 from schemas import GlobalTracks, LocalTracks
 
-__all__ = ["FocusView", "Neighbour", "extent", "neighbours", "predicted"]
+__all__ = [
+    "FocusView",
+]
 
 
 AROUND = 5.0
@@ -50,9 +53,9 @@ class FocusView:
         self._styles = styles
         self._messages: dict[str, deque[tuple[LocalTracks, NDArray[np.bool_]]]] = {}
         self._reaches: deque[float] = deque(maxlen=1000)
-        self._path: tuple[FloatArray, FloatArray] | None = None
+        self._path: Corners | None = None
         self.reach = 1.0
-        self.sight: tuple[FloatArray, FloatArray] | None = None
+        self.sight: Corners | None = None
 
     def hear(self, message: LocalTracks, sound: NDArray[np.bool_]) -> None:
         """Local tracks, of which those are drawn that are `sound` (T,)."""

@@ -30,7 +30,7 @@ from schemas import (
     check_numbers,
 )
 
-__all__ = ["Scene"]
+__all__ = ["MAX_SOURCES", "PATIENCE", "Scene"]
 
 log = logging.getLogger(__name__)
 
@@ -128,10 +128,10 @@ class Scene:
                 self._draw_one(message, fault == 0, stamp)
         if drawn:
             with self._guard("truth", drawn[-1][1]._replace(time=self.now)):
-                for score in self._matcher.scores():
-                    over = self._charts.score(score, self.drawing.centres)
+                for found in self._matcher.matched():
+                    over = self._charts.errors(found, self.drawing.centres)
                     if over:
-                        self._leave_out(score.centre, "too many targets", over, score.stamp)
+                        self._leave_out(found.centre, "too many targets", over, found.stamp)
         self.drawing.colour_sources()
         if self.crowded != self._charts.crowded:
             self.crowded = self.drawing.changed = True

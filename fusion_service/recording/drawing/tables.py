@@ -48,6 +48,7 @@ class Table:
     mass: FloatArray
 
     def part(self, rows: NDArray[Any]) -> Table:
+        """Some of the rows, by numbers or by a mask (T,)."""
         place = Place(*(column[rows] for column in self.place))
         return Table(self.epoch, self.ids[rows], self.times[rows], place, self.codes[rows], self.mass[rows])
 

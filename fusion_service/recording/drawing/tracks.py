@@ -26,7 +26,7 @@ from fusion_service.colours import SCREEN_NEUTRAL, SCREEN_TRUTH, Colour, centre_
 from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import ColumnWriter, Stamp, entity
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
-from fusion_service.recording.drawing.extent import Extent
+from fusion_service.recording.drawing.extent import Corners, Extent
 from fusion_service.recording.drawing.focus import FocusView
 from fusion_service.recording.drawing.geometry import Chart, outline, track_moments
 from fusion_service.recording.drawing.labels import Labels
@@ -72,7 +72,7 @@ class Drawing:
         return self._canvas.chart
 
     @property
-    def bounds(self) -> tuple[FloatArray, FloatArray] | None:
+    def bounds(self) -> Corners | None:
         """South-west and north-east corner (2,) of the square that is seen at first, m: all that the grid covers, or
         the path of the `focus`."""
         return (self._focus.sight if self._focus is not None else None) or self._extent.square

@@ -14,6 +14,10 @@ __all__ = ["fusion_gain"]
 
 
 def fusion_gain(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: int) -> dict[str, dict[str, Any]]:
+    """`Evaluation.shared`: by how many sources had an assigned track, the numbers of those pairs.
+
+    seen (K, T): how many sources had a track on each target at each time; d: dimension of the position.
+    """
     classes = {f"seen_by_{n}": seen == n for n in range(2, len(sources) + 1)} | {"seen_by_2_or_more": seen >= 2}
     both = (seen >= 2) & np.isfinite(fused.errors)
     best, best_nees = _best_single(sources, both)

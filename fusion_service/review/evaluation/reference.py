@@ -53,6 +53,11 @@ def reference_for(
     motion: Motion | None,
     c: float,
 ) -> Reference:
+    """The reference of a mission; frame and space: by default those of the first picture of the first of `centres`.
+
+    motion: of sources without an info. c: the cut-off, m. Raises `NothingToScoreError` for a centre without tracks, and
+    where nothing says a frame and a space.
+    """
     for name in centres:
         if name not in book.centres:
             there = ", ".join(book.centres) or "none"
@@ -83,7 +88,10 @@ def reference_for(
 def scored_truth(
     truths: Sequence[Truth], reference: Reference, pictures: Times | None, every: float | None, gap: float
 ) -> ScoredTruth:
-    """ValueError where there is none."""
+    """The states of all targets at the scored times: `pictures` (K,) ns, or every so many seconds; gap: s.
+
+    Raises `NothingToScoreError`, and `ValueError` as of `truth_path`, where there is none.
+    """
     if every is None and pictures is None:
         raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
     paths = truth_path(truths, reference.frame, reference.axes, reference.speeds)
@@ -105,6 +113,7 @@ def scored_truth(
 
 
 def all_times(book: Logbook, pictures: Times | None, every: float | None) -> Times:
+    """The times (K,), ns, at which a mission without truth is looked at."""
     if every is None:
         return pictures if pictures is not None else np.zeros(0, dtype=np.int64)
     return _multiples(*book.span, every) if book.span else np.zeros(0, dtype=np.int64)

@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 
 from fusion_service.errors import ReviewError
+from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.evaluation.assess import Assessment, Evaluation
 from fusion_service.review.evaluation.report_text import CSS, WORDS
-from fusion_service.review.evaluation.results import facts, label, rows_of, rule_of, utc
+from fusion_service.review.evaluation.results import facts, label, rows_of, rule_of
 from fusion_service.review.evaluation.scoring import Scores
 from fusion_service.review.evaluation.tables import (
     DELAYS,

@@ -20,7 +20,7 @@ from fusion_service.metrics import DENSE, assign_near, near_pairs, nees, nees_bo
 from fusion_service.review.evaluation.continuity import Following, Instant, Siap, ospa2, siap_of
 from fusion_service.review.snapshots import Block, Times
 
-__all__ = ["METRICS", "WINDOW", "P", "Scores", "Series", "Tally", "averages", "bounds", "plain"]
+__all__ = ["METRICS", "WINDOW", "Scores", "Series", "Tally", "averages", "bounds", "plain"]
 
 
 METRICS = (

@@ -16,18 +16,15 @@ if TYPE_CHECKING:
 __all__ = [
     "DELAYS",
     "NUMBERS",
-    "RULES",
     "ScoredCentre",
     "aligned",
     "best_rows",
     "comparison",
     "confirm_line",
-    "consistent",
     "digits",
     "fixed",
     "format_table",
     "links",
-    "metres",
     "pair_words",
     "percent",
     "power_of_ten",
@@ -73,6 +70,7 @@ def digits(value: float) -> str:
 
 
 def fixed(*values: float) -> str:
+    """Two decimals of each, - where one is not finite."""
     return " - ".join(f"{value:.2f}" for value in values) if np.isfinite(values).all() else "-"
 
 

@@ -201,7 +201,8 @@ def _starts(log: StepLog) -> bool:
 
 
 def time_of(text: str, start: int) -> int:
-    """The time, ns, that `text` says: seconds from `start`, or ISO 8601 (UTC unless it says otherwise)."""
+    """The time, ns, that `text` says: seconds from `start`, or ISO 8601 (UTC unless it says otherwise).
+    Raises `ReviewError` for another text."""
     try:
         seconds = float(text)
     except ValueError:

@@ -20,7 +20,14 @@ from fusion_service.review.explain.histories import GONE
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks, MessageError, StepLog, decode
 from schemas.messages import BORN, BROKEN, COASTING, DELETED, GATE_FAILED, KEPT, LINKED, MERGED, SPLIT, TENTATIVE
 
-__all__ = ["Composition", "Happening", "Link", "Member", "Story", "local_messages", "members_of"]
+__all__ = [
+    "Composition",
+    "Happening",
+    "Link",
+    "Member",
+    "Story",
+    "local_messages",
+]
 
 Member = tuple[str, int, int]
 """A local track: source, epoch, id."""

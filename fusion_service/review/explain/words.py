@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from datetime import UTC, datetime
 
 import numpy as np
 
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
+from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.explain.histories import GONE, TrackHistory
 from fusion_service.review.explain.mission import RecordedMission, Refusals
 from fusion_service.review.explain.story import Composition, Happening, Link, Member, Story, local_messages
@@ -28,7 +28,8 @@ MARGIN = 10.0
 
 
 def explanation(mission: RecordedMission) -> str:
-    """The story of `mission.story` in words."""
+    """The story of `mission.story` in words. Raises `ReviewError` where the track was not there at the time asked
+    for."""
     story = mission.story
     assert story is not None
     if story.until is not None and (story.until < story.first or story.composition is None):
@@ -52,7 +53,7 @@ def listing(mission: RecordedMission, *, everything: bool = False) -> str:
         sources = " ".join(sorted(one.sources)) or "-"
         numbers = [f"{value:.1f}" for value in (first, last, last - first)]
         rows.append([mission.labels(one.track), *numbers, str(one.events), sources, _became(mission, one)])
-    head = f"{mission.path}: centre {mission.centre.name}, {mission.steps} steps from {_utc(mission.start)}"
+    head = f"{mission.path}: centre {mission.centre.name}, {mission.steps} steps from {utc(mission.start, 'T')}"
     left = len(lives) - len(shown)
     never = f"; {left} more were never confirmed (--all lists them)" if left else ""
     count = f"{len(shown)} track{'s' * (len(shown) != 1)}"
@@ -108,7 +109,7 @@ class _Teller:
         span = f"{self.time(story.first)} to {self.time(story.last)} s"
         return [
             f"track {self.label(track)}{whole} of centre {mission.centre.name} in {mission.path}",
-            f"mission from {_utc(mission.start)}, {mission.steps} steps, rule {mission.rule}{gates}",
+            f"mission from {utc(mission.start, 'T')}, {mission.steps} steps, rule {mission.rule}{gates}",
             f"lived from {span}, {story.steps} steps: {status}; {existence}",
         ]
 
@@ -343,7 +344,3 @@ def _table(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:
         ]
         lines.append("  ".join(cells).rstrip())
     return lines
-
-
-def _utc(at: int) -> str:
-    return datetime.fromtimestamp(at // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

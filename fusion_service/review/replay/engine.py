@@ -27,16 +27,20 @@ class Engine(Protocol):
     """
 
     @property
-    def apart(self) -> str: ...
+    def apart(self) -> str:
+        """In words."""
 
     @property
-    def changed(self) -> tuple[int, int, Difference] | None: ...
+    def changed(self) -> tuple[int, int, Difference] | None:
+        """The first such step."""
 
     @property
-    def uncompared(self) -> Sequence[object]: ...
+    def uncompared(self) -> Sequence[object]:
+        """Each in words, by `str`."""
 
     @property
-    def buffered(self) -> int: ...
+    def buffered(self) -> int:
+        """How many."""
 
     def input(self, message: LocalMessage, received: int, size: int) -> None:
         """A message of a source, `size` bytes long, received at `received` ns."""

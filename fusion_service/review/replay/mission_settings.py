@@ -28,6 +28,7 @@ class MissionSettings:
     """The settings of each run of the centre that is followed. given: of a config file, above what is recorded.
 
     foreign: the hash of `given` where no run had these settings. first: those of the first run. told: in words.
+    Raises `ReviewError` where the settings are not in the recording, or cannot be used.
     """
 
     def __init__(

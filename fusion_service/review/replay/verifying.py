@@ -15,7 +15,7 @@ from fusion_service.centre import StepResult
 from fusion_service.recording.steps import Step
 from schemas import DECISIONS, STATUSES, GlobalTracks, StepLog, digest
 
-__all__ = ["Difference", "Verdict", "differences", "published_as"]
+__all__ = ["Difference", "Verdict", "published_as"]
 
 
 class Difference(NamedTuple):
