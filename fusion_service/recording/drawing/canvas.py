@@ -15,7 +15,7 @@ from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import ColumnWriter, Lines, Points, Stamp
 from fusion_service.recording.drawing.geometry import CORNERS, Chart, Outline, Place, ellipses
 from fusion_service.recording.drawing.tables import COASTING, LEVELS, Table, hold, levels
-from schemas import Frame, Height
+from schemas import Frame
 
 __all__ = ["WIDTH", "Canvas"]
 
@@ -33,16 +33,11 @@ class Canvas:
         self.chart: Chart | None = None if frame is None else Chart(frame)
         self.tables: dict[str, Table] = {}
 
-    def place(
-        self,
-        means: FloatArray,
-        covariances: FloatArray,
-        space: tuple[str, ...],
-        frame: Frame,
-        height: Height | None = None,
-    ) -> Place:
-        """Positions of states (T, n), (T, n, n) on the chart. Raises `geodesy.FrameError` if `frame` has none there."""
-        return self._placing.place(means, covariances, space, frame, height)
+    @property
+    def placing(self) -> Chart:
+        """The chart, which is there by now."""
+        assert self.chart is not None, "a chart comes first"
+        return self.chart
 
     def points(self, path: str, place: Place, labels: list[str], stamp: Stamp) -> None:
         """Points without classes."""
@@ -90,13 +85,8 @@ class Canvas:
         self.tables[path] = new
         return new
 
-    @property
-    def _placing(self) -> Chart:
-        assert self.chart is not None, "a chart comes first"
-        return self.chart
-
     def _points(self, place: Place, labels: list[str], classes: NDArray[np.uint16] | None = None) -> Points:
-        return Points(self._placing.plane(place.xy), self._placing.geo(place.xy, place.z), labels, classes)
+        return Points(self.placing.plane(place.xy), self.placing.geo(place.xy, place.z), labels, classes)
 
     def _lines(self, xy: FloatArray, z: FloatArray, lengths: NDArray[np.int64], **looks: Any) -> Lines:
-        return Lines(self._placing.plane(xy), self._placing.geo(xy, z), lengths, **looks)
+        return Lines(self.placing.plane(xy), self.placing.geo(xy, z), lengths, **looks)

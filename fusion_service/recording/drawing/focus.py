@@ -131,7 +131,9 @@ class FocusView:
             return None
         message, sound = past[-1]
         means, covariances = predicted(message, time)
-        place = self._canvas.place(means[sound], covariances[sound], message.space, message.frame, message.height)
+        place = self._canvas.placing.place(
+            means[sound], covariances[sound], message.space, message.frame, message.height
+        )
         return tabulate(message.epoch, message.time, message.ids[sound], place)
 
 

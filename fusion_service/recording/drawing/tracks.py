@@ -101,11 +101,11 @@ class Drawing:
             return
         self._source(info.source)
         path, canvas = entity("picture", "sensors", info.source), self._canvas
-        place = canvas.place(np.array([info.position]), np.zeros((1, 3, 3)), ("x", "y", "z"), info.frame)
+        place = canvas.placing.place(np.array([info.position]), np.zeros((1, 3, 3)), ("x", "y", "z"), info.frame)
         self._grow(place.xy, main=True)
         canvas.points(path, place, [info.source], stamp)
         edges, frame = outline(info)
-        moved = [canvas.place(edge, np.zeros((len(edge), 2, 2)), ("x", "y"), frame) for edge in edges]
+        moved = [canvas.placing.place(edge, np.zeros((len(edge), 2, 2)), ("x", "y"), frame) for edge in edges]
         xy = np.concatenate([np.zeros((0, 2)), *(part.xy for part in moved)])
         z = np.concatenate([np.zeros(0), *(part.z for part in moved)])
         canvas.lines(f"{path}/coverage", xy, z, np.array([len(edge) for edge in edges], dtype=np.int64), stamp)
@@ -114,7 +114,9 @@ class Drawing:
         """`sound` (T,): the tracks that are drawn. Returns how many components are too many to draw."""
         self._source(message.source)
         means, covariances = track_moments(message)
-        place = self._canvas.place(means[sound], covariances[sound], message.space, message.frame, message.height)
+        place = self._canvas.placing.place(
+            means[sound], covariances[sound], message.space, message.frame, message.height
+        )
         ids = message.ids[sound]
         mass = None if message.existence is None else message.existence[sound]
         table = tabulate(message.epoch, message.time, ids, place, mass=mass)
@@ -139,7 +141,7 @@ class Drawing:
     def global_tracks(self, message: GlobalTracks, sound: NDArray[np.bool_], stamp: Stamp) -> int:
         """`sound` (T,): the tracks that are drawn. Returns how many components are too many to draw."""
         means, covariances = track_moments(message)
-        place = self._canvas.place(means[sound], covariances[sound], message.space, message.frame)
+        place = self._canvas.placing.place(means[sound], covariances[sound], message.space, message.frame)
         status, mass = message.status[sound], message.existence[sound]
         table = tabulate(message.epoch, message.time, message.ids[sound], place, status, mass)
         self._grow(table.place.xy, main=True)
@@ -162,7 +164,9 @@ class Drawing:
     def truth(self, message: Truth, stamp: Stamp) -> None:
         """True positions, and their trail."""
         n = len(message.space)
-        place = self._canvas.place(message.means, np.zeros((len(message.ids), n, n)), message.space, message.frame)
+        place = self._canvas.placing.place(
+            message.means, np.zeros((len(message.ids), n, n)), message.space, message.frame
+        )
         table = tabulate(message.epoch, message.time, message.ids, place)
         self._grow(table.place.xy, main=True)
         path = self._scenarios[message.source] = entity("picture", "truth", message.source)
@@ -230,7 +234,7 @@ class Drawing:
             return 0
         height = None if isinstance(message, GlobalTracks) else message.height
         means, covariances = message.means[rows], message.covariances[rows]
-        place = self._canvas.place(means, covariances, message.space, message.frame, height)
+        place = self._canvas.placing.place(means, covariances, message.space, message.frame, height)
         whole = isinstance(message, LocalIntensity)
         tracks = np.arange(len(sound), dtype=np.uint64) if isinstance(message, LocalIntensity) else message.ids
         codes = message.status[owner] if isinstance(message, GlobalTracks) else None
