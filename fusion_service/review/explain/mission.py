@@ -18,11 +18,11 @@ from fusion_service.recording import RawMessage, read
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.steps import Step, Steps
 from fusion_service.recording.survey import RecordedCentre, key_of, survey
-from fusion_service.review.explain.lives import Lives
+from fusion_service.review.explain.histories import TrackHistories
 from fusion_service.review.explain.story import Story
 from schemas import GlobalTracks, MessageError, StepLog, decode
 
-__all__ = ["Mission", "Refusals", "read_mission"]
+__all__ = ["RecordedMission", "Refusals", "read_mission"]
 
 RECENT = 8
 """Messages of a source that are looked at for what it says of a track."""
@@ -47,13 +47,13 @@ class Refusals:
 
 
 @dataclass
-class Mission:
+class RecordedMission:
     """What was read of a centre. Times in ns; start: of its first step; steps: how many; story: of the track asked
     for; config: its newest settings, None where they are not known."""
 
     path: Path
     centre: RecordedCentre
-    lives: Lives = field(default_factory=Lives)
+    histories: TrackHistories = field(default_factory=TrackHistories)
     labels: Labels = field(default_factory=Labels)
     start: int = 0
     steps: int = 0
@@ -81,7 +81,7 @@ def read_mission(
     at: str | None = None,
     centre: str | None = None,
     stop: Event | None = None,
-) -> Mission:
+) -> RecordedMission:
     """Read what a centre did, and the story of `track` (a label, or a whole id) with its moment at `at`.
 
     `ReviewError` where the recording, the track or the time is not as it must be.
@@ -90,7 +90,7 @@ def read_mission(
     found = survey(path, stop)
     if stop.is_set():
         raise ReviewError("stopped")
-    mission = Mission(found.path, found.shown(centre))
+    mission = RecordedMission(found.path, found.shown(centre))
     if track is not None:
         try:
             mission.labels.find(track)
@@ -109,7 +109,7 @@ def read_mission(
     if not mission.steps:
         raise ReviewError(f"{path}: centre {mission.centre.name} made no step that can be read")
     if track is not None and (mission.story is None or mission.story.first < 0):
-        number = len(mission.lives.known)
+        number = len(mission.histories.known)
         raise ReviewError(
             f"{path}: centre {mission.centre.name} has no track {track}: it has {number}, from "
             f"{_ends(mission)}; without --track they are listed"
@@ -120,7 +120,7 @@ def read_mission(
 class _Reader:
     """Takes the messages of a recording as they came."""
 
-    def __init__(self, mission: Mission, track: str | None, at: str | None) -> None:
+    def __init__(self, mission: RecordedMission, track: str | None, at: str | None) -> None:
         self._mission = mission
         self._track = track
         self._at = at
@@ -160,7 +160,7 @@ class _Reader:
             mission.start = step.time
             self._until = None if self._at is None else time_of(self._at, step.time)
         mission.steps += 1
-        mission.lives.step(step)
+        mission.histories.step(step)
         if step.picture is not None:
             mission.rule = step.picture.rule
         if step.log is not None:
@@ -201,7 +201,8 @@ def _starts(log: StepLog) -> bool:
 
 
 def time_of(text: str, start: int) -> int:
-    """The time, ns, that `text` says: seconds from `start`, or ISO 8601 (UTC unless it says otherwise)."""
+    """The time, ns, that `text` says: seconds from `start`, or ISO 8601 (UTC unless it says otherwise).
+    Raises `ReviewError` for another text."""
     try:
         seconds = float(text)
     except ValueError:
@@ -218,7 +219,7 @@ def time_of(text: str, start: int) -> int:
     return start + round(seconds * 1e9)
 
 
-def _ends(mission: Mission) -> str:
+def _ends(mission: RecordedMission) -> str:
     """The first and the last track there are."""
-    known = sorted(mission.lives.known)
+    known = sorted(mission.histories.known)
     return f"{mission.labels(known[0])} to {mission.labels(known[-1])}" if known else "none"
