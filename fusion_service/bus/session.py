@@ -25,6 +25,7 @@ import zenoh
 from zenoh import ext
 
 from fusion_service.bus.inbox import Inbox
+from fusion_service.errors import FusionError, Stopped
 from schemas import MAX_BYTES
 
 __all__ = [
@@ -51,11 +52,11 @@ MAX_PUBLISHERS = 4096
 log = logging.getLogger(__name__)
 
 
-class BusError(Exception):
+class BusError(FusionError):
     """What the user can mend about the bus, in one line."""
 
 
-class BusStopped(BusError):
+class BusStopped(Stopped, BusError):
     """`stop` was set while waiting for the hub."""
 
 

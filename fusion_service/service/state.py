@@ -15,13 +15,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from fusion_service.errors import FusionError
+
 __all__ = ["State", "StateError", "open_state"]
 
 YEAR_2020 = 1_577_836_800
 SYNC_PERIOD = 5.0
 
 
-class StateError(Exception):
+class StateError(FusionError):
     """The folder cannot be used, and why, in one line."""
 
 

@@ -1,11 +1,12 @@
-"""Sizes and durations as people write them: 500MB, 20 GB, 90s, 1h, 7d."""
+"""Values of options as people write them: 500MB, 90s, 7d, tcp/host:port, host:port. All raise `ValueError` in one line;
+`fusion_service.process.argument` makes the type of an argument of one, and `positive` and `whole` stand there."""
 
 from __future__ import annotations
 
 import math
 import re
 
-__all__ = ["duration", "size"]
+__all__ = ["duration", "port", "size"]
 
 SIZES = {"b": 1, "": 1} | {
     f"{prefix}{suffix}": base**power
@@ -25,6 +26,13 @@ def size(text: str) -> int:
 def duration(text: str) -> float:
     """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. `ValueError` in one line."""
     return _value(text, SECONDS, "a duration: give a number and s, min, h, d or w, as in 1h")
+
+
+def port(text: str) -> int:
+    """A TCP port. `ValueError` in one line."""
+    if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
+        raise ValueError(f"{text!r} is not a port")
+    return int(text)
 
 
 def _value(text: str, units: dict[str, float] | dict[str, int], what: str) -> float:
