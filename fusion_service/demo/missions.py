@@ -6,7 +6,7 @@ import tomllib
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_service.errors import UsageError
+from fusion_service.errors import DataError, UsageError
 from fusion_service.process import data_folder
 
 __all__ = ["AUTOFERRY", "THREE_RADARS", "MissionPlan", "plan_mission"]
@@ -55,7 +55,8 @@ def plan_mission(
 ) -> MissionPlan:
     """The plan of `three-radars` (with `seed` and `tracker`) or of `autoferry:N` (from `data`, or $FUSION_DATA).
 
-    Raises `UsageError` for any other, for options that do not go with it, and where there are no such data.
+    Raises `UsageError` for any other, for options that do not go with it and where no data are named; `DataError` where
+    they are not there.
     """
     if scenario == "three-radars":
         if cameras:
@@ -74,7 +75,7 @@ def plan_mission(
     if folder is None:
         raise UsageError("autoferry needs its recordings: give their folder with --data or in FUSION_DATA")
     if not (folder / f"scenario{number}_detections.json").is_file():
-        raise UsageError(f"no scenario{number}_detections.json in {folder}: --data names the Autoferry folder")
+        raise DataError(f"no scenario{number}_detections.json in {folder}: --data names the Autoferry folder")
     command = ["playback", scenario, "--data", str(folder), "--sensor"]
     clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
     return MissionPlan(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)

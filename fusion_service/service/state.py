@@ -39,9 +39,9 @@ class State:
         self._synced = 0.0
         self._last = 0
 
-    def take_generation(self) -> int:
-        """A generation that was never taken before, on disk when this returns. `StateError` or `OSError` if it
-        cannot be; the next one after the last of this process is then safe only as long as it lives."""
+    def new_generation(self) -> int:
+        """A generation that was never taken before, on disk when this returns. Raises `StateError` or
+        OSError if it cannot be; the next one after the last of this process is then safe only as long as it lives."""
         last = self._last
         if self._folder is not None:
             path = self._folder / "generation"
@@ -95,7 +95,7 @@ class State:
 
 @contextlib.contextmanager
 def open_state(folder: str | None) -> Iterator[State]:
-    """The state in `folder` (made if need be), held against a second service. `StateError` if it cannot be."""
+    """The state in `folder` (made if need be), held against a second service. Raises `StateError` if it cannot be."""
     if folder is None:
         yield State(None)
         return

@@ -17,7 +17,7 @@ from fusion_service.cli import main
 from fusion_service.config import ConfigError, load_config
 from fusion_service.demo import DemoError, plan_mission, run_demo
 from fusion_service.demo import run as run_module
-from fusion_service.errors import UsageError
+from fusion_service.errors import DataError, UsageError
 from fusion_service.recording import messages
 from schemas import Enu, GlobalTracks, StepLog, Truth
 from tests.helpers import fuse_again
@@ -171,7 +171,6 @@ def test_bad_values_of_options_are_bad_usage(arguments: tuple[str, ...], capsys:
         ("three-radars", {"cameras": True}, "--cameras goes with"),
         ("autoferry:2", {"tracker": "imm"}, "--tracker goes with"),
         ("autoferry:2", {}, "--data or in FUSION_DATA"),
-        ("autoferry:2", {"data": "nowhere"}, "no scenario2_detections.json in nowhere"),
     ],
 )
 def test_what_is_no_mission_is_bad_usage(
@@ -187,6 +186,8 @@ def test_the_data_may_stand_in_a_folder_of_their_name(tmp_path: Path) -> None:
     inside = tmp_path / "autoferry"
     inside.mkdir()
     (inside / "scenario2_detections.json").touch()
+    with pytest.raises(DataError, match=r"no scenario3_detections\.json in"):
+        plan_mission("autoferry:3", data=str(tmp_path))
     for given in (tmp_path, inside):
         plan = plan_mission("autoferry:2", data=str(given))
         assert str(inside) in plan.clients["lidar"]

@@ -208,7 +208,7 @@ def test_a_step_that_fails_does_not_end_the_service(
     stop = threading.Event()
     with open_state(str(scene.folder / "state")) as state, open_bus([scene.endpoint], wait=10.0) as bus:
         service = Service(load_config(path), bus, state)
-        service._centre.restored = True  # type: ignore[attr-defined]
+        service._lasting.centre.restored = True  # type: ignore[attr-defined]
         thread = threading.Thread(target=service.run, args=(stop,))
         thread.start()
         try:
@@ -259,7 +259,7 @@ def test_ctrl_c_ends_everything_at_once(tmp_path: Path) -> None:
     [
         (["run", "--config", "nowhere.toml"], 2, "cannot be read"),
         (["record", "--out", "/proc/nowhere/x.rrd", "--connect", "tcp/127.0.0.1:1"], 1, "fusion-service record:"),
-        (["demo", "--scenario", "moon"], 1, "unknown scenario 'moon'"),
+        (["demo", "--scenario", "moon"], 2, "unknown scenario 'moon'"),
         (["demo", "--scenario", "autoferry:2", "--data", "/nowhere"], 1, "--data names the Autoferry folder"),
     ],
 )
