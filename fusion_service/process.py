@@ -127,7 +127,7 @@ def argument(read: Callable[[str], T]) -> Callable[[str], T]:
 
 
 def positive(text: str) -> float:
-    """A number above 0. `ValueError` in one line."""
+    """A number above 0. Raises ValueError in one line."""
     try:
         value = float(text)
     except ValueError:
@@ -138,7 +138,7 @@ def positive(text: str) -> float:
 
 
 def whole(text: str) -> int:
-    """A whole number from 0. `ValueError` in one line."""
+    """A whole number from 0. Raises ValueError in one line."""
     if not (text.isascii() and text.isdigit() and len(text) < 19):
         raise ValueError(f"{text!r} is not a whole number from 0")
     return int(text)

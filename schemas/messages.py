@@ -36,6 +36,7 @@ __all__ = [
     "TENTATIVE",
     "Decisions",
     "Entry",
+    "Floats",
     "GlobalTracks",
     "Header",
     "LocalIntensity",
