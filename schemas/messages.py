@@ -34,6 +34,7 @@ __all__ = [
     "SPLIT",
     "STATUSES",
     "TENTATIVE",
+    "U64",
     "Decisions",
     "Entry",
     "Floats",

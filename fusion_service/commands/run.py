@@ -32,6 +32,9 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Run the service until `stop` is set. Raises `ConfigError`, `BusError`, `StateError`."""
     from fusion_service.bus import open_bus
     from fusion_service.config import ServiceConfig, load_config
+
+    if stop.is_set():  # what follows is slow to load
+        return
     from fusion_service.service.daemon import run_service
 
     config = load_config(args.config) if args.config else ServiceConfig()
