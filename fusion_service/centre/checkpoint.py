@@ -14,6 +14,7 @@ import numpy as np
 
 from fusion_service.centre.lifecycle import Picture, empty_picture
 from fusion_service.centre.sources import Source, Tracks, empty_tracks, padded
+from fusion_service.errors import FusionError
 from schemas import Ecef, Enu, Frame, Local, SensorInfo, decode, encode
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ _PLAIN = (
 Columns = TypeVar("Columns", Tracks, Picture)
 
 
-class CheckpointError(ValueError):
+class CheckpointError(FusionError, ValueError):
     """A checkpoint that cannot be used, and why, in one line."""
 
 

@@ -1,13 +1,24 @@
-"""Does a global track exist: fused from the sources that say so, lowered by those that look and see nothing.
+"""Does a global track exist: a Bernoulli filter over what its sources report, see and do not see.
 
-Whenever a source with an opinion brings new data, the existence of its global track is fused anew from all
-linked sources that report one, by the configured method (`fusion_service.existence`; "geometric" multiplies by the
-overlap of the densities and loses existence, which is why it is kept: to show it). A source whose coverage holds the
-place, that has no track there, lowers it once per complete scan received, r' = r (1 - p) / (1 - r p), p its declared
-detection probability, once its declared initiation delay has passed for the track.
+In log-odds, existence is an opinion and the evidence since: logit r = opinion + evidence, bounded by `MOST`.
+
+* Birth: the opinion is that of `birth_existence`.
+* A source that reports existence gives an opinion, not evidence: whenever one brings new data, the opinion becomes the
+  value fused from all linked sources that report one (`fusion_service.existence`, by the configured method;
+  "geometric" multiplies by the overlap of the densities and loses existence, which is kept to show it). Its repeated
+  word changes nothing more.
+* A new datum of a source that reports none is evidence: log(p / f), p its detection probability and f its
+  `false_track`, the chance that a report of a track of it is of nothing.
+* A complete scan of a source that covers the place and has no new datum of the track is evidence, log(1 - p), once per
+  scan received (the Bernoulli filter's r' = r (1 - p) / (1 - r p)), after the track has been in its coverage for its
+  initiation delay. Where coverage or detection probability is not declared, nothing is lowered.
+* Without any new datum the target may be gone: r' = r s^dt, s the `survival` of a second.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,33 +27,107 @@ from fusion_service.centre.association import by_size
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
+from fusion_service.centre.sources import Source
+from fusion_service.config import SourceConfig
 from fusion_service.coverage import covers
 from fusion_service.densities import Mixtures, power_product
-from fusion_service.existence import fuse_existence, lower_existence
+from fusion_service.existence import fuse_existence
 
-__all__ = ["existence_now"]
+__all__ = ["Entries", "update_existence"]
 
 Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 
+MOST = float(np.log(0.9999 / 0.0001))
+"""Log-odds beyond which nothing is believed or denied: from there a few data lead back."""
 MOST_CERTAIN = 0.999
 """No sensor is believed to see more surely than this."""
-
+USUAL_DETECTION = 0.9
+"""Of a source that does not declare it."""
 MOST_OVERLAPPING = 32
 """Beyond so many sources the overlap is not worked out, and existence is fused by the consistent rule."""
 
 
-def existence_now(rows: Rows, picture: Picture, fresh: NDArray[np.bool_], intake: Intake, time: int) -> Floats:
-    """Existence (G,) of the picture's tracks at `time`, ns. fresh (G,): tracks with new data in this step."""
-    existence = picture.existence.copy()
-    linked = rows.linked()
-    saying = linked[np.isfinite(rows.tracks.existence[linked])]
+@dataclass(slots=True)
+class Entries:
+    """When each global track came into the coverage of each source: by name the ids (K,), sorted, and times (K,) ns."""
+
+    by_source: dict[str, tuple[NDArray[np.uint64], NDArray[np.int64]]] = field(default_factory=dict)
+
+    def note(self, name: str, picture: Picture, covered: Bools, time: int) -> NDArray[np.int64]:
+        """The time (G,) since when each track is covered, `time` for one that was not before and for others."""
+        ids, since = self.by_source.get(name, (picture.id[:0], picture.time[:0]))
+        entered = np.full(len(picture.id), time, dtype=np.int64)
+        if len(ids):
+            at = np.minimum(np.searchsorted(ids, picture.id), len(ids) - 1)
+            known = covered & (ids[at] == picture.id)
+            entered[known] = since[at[known]]
+        self.by_source[name] = (picture.id[covered], entered[covered])
+        return entered
+
+    def keep(self, names: set[str]) -> None:
+        """Forget all other sources."""
+        self.by_source = {name: kept for name, kept in self.by_source.items() if name in names}
+
+    def packed(self) -> list[Any]:
+        """As plain values, in order."""
+        return [
+            [name, ids.astype("<u8").tobytes(), since.astype("<i8").tobytes()]
+            for name, (ids, since) in sorted(self.by_source.items())
+        ]
+
+    @classmethod
+    def unpacked(cls, packed: list[Any]) -> Entries:
+        """From what `packed` gave."""
+        made = cls()
+        for name, ids, since in packed:
+            made.by_source[str(name)] = (
+                np.frombuffer(ids, "<u8").astype(np.uint64),
+                np.frombuffer(since, "<i8").astype(np.int64),
+            )
+        return made
+
+
+def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time: int, before: int) -> Picture:
+    """The picture with existence at the step at `time`, ns, the last one having been at `before` (-1: none)."""
+    config, count = intake.config, len(picture.id)
+    inside = rows.inside()
+    at = picture.find(rows.tracks.link[inside])
+    fresh = rows.fresh[inside]
+    says = np.isfinite(rows.tracks.existence[inside])
+    hit = np.bincount(at[fresh], minlength=count) > 0
+    opinion = np.where(picture.time < 0, _logit(config.birth_existence), picture.opinion)
+    evidence = picture.evidence.copy()
+    opinion, told = _opinions(rows, picture, inside[says], hit, opinion, config.existence)
+    names = intake.names()
+    declared = [intake.declared(intake.sources[name]) for name in names]
+    gain = np.array([_gain(one) for one in declared])
+    counted = fresh & ~says
+    np.add.at(evidence, at[counted], gain[rows.source[inside[counted]]])
+    opinion, evidence = np.where(told, opinion + 0.0, opinion), evidence
+    evidence = evidence + _missed(rows, picture, intake, declared, entries, time)
+    if before >= 0:
+        quiet = ~hit & (picture.time >= 0)
+        r = _sigmoid(np.clip(opinion + evidence, -MOST, MOST)) * config.survival ** ((time - before) / 1e9)
+        evidence = np.where(quiet, _logit(r) - opinion, evidence)
+    total = np.clip(opinion + evidence, -MOST, MOST)
+    return replace(picture, opinion=opinion, evidence=total - opinion, existence=_sigmoid(total))
+
+
+def _opinions(
+    rows: Rows, picture: Picture, saying: NDArray[np.intp], hit: Bools, opinion: Floats, method: str
+) -> tuple[Floats, Bools]:
+    """The opinion of all sources that report existence, where one has new data; and where that is."""
+    opinion, told = opinion.copy(), np.zeros(len(picture.id), dtype=np.bool_)
+    new = np.zeros(len(picture.id), dtype=np.bool_)
+    new[picture.find(rows.tracks.link[saying[rows.fresh[saying]]])] = True
     for ids, members in by_size(rows.tracks.link[saying]):
         at = picture.find(ids)
-        new = fresh[at]
-        existence[at[new]] = _fused(rows, saying[members[new]], intake.config.existence)
-    if intake.frame is None:
-        return existence
-    return _lowered(existence, rows, picture, intake, time)
+        some = new[at]
+        if some.any():
+            opinion[at[some]] = _logit(_fused(rows, saying[members[some]], method))
+            told[at[some]] = True
+    return opinion, told
 
 
 def _fused(rows: Rows, members: NDArray[np.intp], method: str) -> Floats:
@@ -63,18 +148,51 @@ def _fused(rows: Rows, members: NDArray[np.intp], method: str) -> Floats:
     return np.asarray(fuse_existence(inside, "geometric", overlap=np.clip(np.nan_to_num(overlap), 0.0, 1.0)))
 
 
-def _lowered(existence: Floats, rows: Rows, picture: Picture, intake: Intake, time: int) -> Floats:
-    places = [intake.config.space.index(axis) for axis in ("x", "y", "z") if axis in intake.config.space]
+def _gain(declared: SourceConfig) -> float:
+    """log(p / f) of a new datum of a source, never below 0."""
+    p = USUAL_DETECTION if declared.detection_probability is None else declared.detection_probability
+    return float(np.log(max(p, declared.false_track) / declared.false_track))
+
+
+def _missed(
+    rows: Rows, picture: Picture, intake: Intake, declared: list[SourceConfig], entries: Entries, time: int
+) -> Floats:
+    """What the scans of the step that show nothing new of a track add to its log-odds (G,)."""
+    total = np.zeros(len(picture.id))
     frame = intake.frame
-    assert frame is not None
-    age = (time - picture.born) / 1e9
-    for index, (_, source) in enumerate(sorted(intake.sources.items())):
-        info = source.info
-        if not source.scans or source.muted or info is None or not info.detection_probability:
+    looking = {
+        name: (source, said)
+        for (name, source), said in zip(sorted(intake.sources.items()), declared, strict=True)
+        if not source.muted and said.coverage is not None and said.detection_probability
+    }
+    entries.keep(set(looking))
+    if frame is None or not len(picture.id):
+        return total
+    places = [intake.config.space.index(axis) for axis in ("x", "y", "z") if axis in intake.config.space]
+    index = {name: number for number, name in enumerate(intake.names())}
+    new = rows.fresh | rows.tracks.outside
+    for name, (source, said) in looking.items():
+        covered = (picture.time >= 0) & covers(_seen_from(source, said), picture.mean[places], frame)
+        entered = entries.note(name, picture, covered, time)
+        if not source.scans:
             continue
-        own = rows.tracks.link[rows.source == index]
-        missed = (picture.time >= 0) & (age >= info.initiation_delay) & ~np.isin(picture.id, own)
-        missed &= covers(info, picture.mean[places], frame)
-        chance = 1 - (1 - min(info.detection_probability, MOST_CERTAIN)) ** source.scans
-        existence[missed] = lower_existence(existence[missed], min(chance, MOST_CERTAIN))
-    return existence
+        told = rows.tracks.link[(rows.source == index[name]) & new]
+        missed = covered & (time - entered >= said.initiation_delay * 1e9) & ~np.isin(picture.id, told)
+        p = min(float(said.detection_probability or 0.0), MOST_CERTAIN)
+        total[missed] += source.scans * np.log1p(-p)
+    return total
+
+
+def _seen_from(source: Source, said: SourceConfig) -> Any:
+    """The source's word with the coverage that holds for it."""
+    assert source.info is not None
+    return replace(source.info, coverage=said.coverage)
+
+
+def _logit(r: Any) -> Any:
+    r = np.clip(r, 1e-12, 1 - 1e-12)
+    return np.log(r) - np.log1p(-r)
+
+
+def _sigmoid(x: Floats) -> Floats:
+    return np.asarray(1.0 / (1.0 + np.exp(-x)))

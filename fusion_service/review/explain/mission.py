@@ -12,7 +12,7 @@ from threading import Event
 from scipy.stats import chi2
 
 from fusion_service.config import CentreConfig, ConfigError, centre_config
-from fusion_service.errors import ReviewError
+from fusion_service.errors import ReviewError, Stopped
 from fusion_service.progress import Progress
 from fusion_service.recording import RawMessage, read
 from fusion_service.recording.drawing.labels import Labels
@@ -89,7 +89,7 @@ def read_mission(
     stop = stop or Event()
     found = survey(path, stop)
     if stop.is_set():
-        raise ReviewError("stopped")
+        raise Stopped("stopped")
     mission = RecordedMission(found.path, found.shown(centre))
     if track is not None:
         try:
@@ -101,7 +101,7 @@ def read_mission(
     with Progress("Reading") as bar:
         for number, raw in enumerate(read(path)):
             if stop.is_set():
-                raise ReviewError(f"stopped after {mission.steps} steps")
+                raise Stopped(f"stopped after {mission.steps} steps")
             reader.take(raw)
             if number % SHOWN == 0:
                 bar.show(number / found.messages, f"{mission.steps} steps")

@@ -29,7 +29,7 @@ def test_mistakes_are_told_before_anything_is_written(mission: Path, tmp_path: P
         (["--rule", "ci:colour=red", "--out", str(out)], 2, "ci has no option 'colour'"),
         (["--set", "gate=7", "--out", str(out)], 2, "gate"),
         (["--set", "gate", "--out", str(out)], 2, "write KEY=VALUE"),
-        ([], 1, "nothing to do"),
+        ([], 2, "nothing to do"),
         (["--verify", "--rule", "ci"], 1, "leave out --rule"),
         (["--out", str(mission)], 1, "exists already"),
         (["--out", str(mission.parent / "parts")], 1, "exists already"),

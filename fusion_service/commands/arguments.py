@@ -1,11 +1,12 @@
-"""Sizes and durations as people write them: 500MB, 20 GB, 90s, 1h, 7d."""
+"""Values of options as people write them: 500MB, 90s, 7d, tcp/host:port, host:port. All raise ValueError in one line;
+`fusion_service.process.argument` makes the type of an argument of one, and `positive` and `whole` stand there."""
 
 from __future__ import annotations
 
 import math
 import re
 
-__all__ = ["duration", "size"]
+__all__ = ["duration", "port", "size"]
 
 SIZES = {"b": 1, "": 1} | {
     f"{prefix}{suffix}": base**power
@@ -17,14 +18,21 @@ TEXT = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)", re.ASCII)
 
 
 def size(text: str) -> int:
-    """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500` 500 bytes. `ValueError` in one line."""
+    """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500` 500 bytes. Raises ValueError in one line."""
     value = _value(text, SIZES, "a size: give a number and B, kB, MB, GB, TB or KiB, MiB, GiB, as in 500MB")
     return math.ceil(value)
 
 
 def duration(text: str) -> float:
-    """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. `ValueError` in one line."""
+    """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. Raises ValueError in one line."""
     return _value(text, SECONDS, "a duration: give a number and s, min, h, d or w, as in 1h")
+
+
+def port(text: str) -> int:
+    """A TCP port. Raises ValueError in one line."""
+    if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
+        raise ValueError(f"{text!r} is not a port")
+    return int(text)
 
 
 def _value(text: str, units: dict[str, float] | dict[str, int], what: str) -> float:
