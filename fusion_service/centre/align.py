@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.centre.intake import Intake
+from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import Columns, Tracks, join_tracks, no_parts
 from fusion_service.densities import Mixtures
@@ -24,18 +25,19 @@ LINK_COLUMNS = ("link", "since", "fails", "used")
 
 def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table, and
-    so does what has no sound density there (refused: ill-conditioned)."""
+    so does what has no sound density there (refused: ill-conditioned); what is not used, and why, is told."""
     config = intake.config
     parts: list[Tracks] = []
     index: list[NDArray[np.intp]] = []
     epochs: list[NDArray[np.uint64]] = []
     starts: list[NDArray[np.bool_]] = []
     kept: dict[str, int] = {}
+    room = MAX_TOTAL // max(len(intake.sources), 1)
     for number, (name, source) in enumerate(sorted(intake.sources.items())):
         said = intake.declared(source)
-        oldest = time - round(config.stale_periods * said.period * 1e9)
-        source.tracks = table = source.tracks.take(source.tracks.time >= oldest)
+        table = retire(source, said, time, room, config)
         if source.muted or not intake.ready(source):
+            leave_out(source)
             continue
         predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)

@@ -20,7 +20,22 @@ import numpy as np
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.config.toml_text import dotted, key_lines, line_of, toml_value
-from schemas import Ecef, Enu, Frame, Height, Local, Motion, check_name, check_realm, check_space
+from schemas import (
+    Coverage,
+    Disk,
+    Ecef,
+    Enu,
+    Frame,
+    Height,
+    Local,
+    Motion,
+    Polygon,
+    Sector,
+    check_name,
+    check_realm,
+    check_space,
+)
+from schemas.values import coverage
 
 __all__ = [
     "BusConfig",
@@ -166,6 +181,10 @@ def _maybe(read: Callable[[Any], T]) -> Callable[[Any], T | None]:
     return lambda value: None if value is None else read(value)
 
 
+def _coverage(value: Any) -> Coverage:
+    return value if isinstance(value, (Disk, Sector, Polygon)) else coverage(_table(value))
+
+
 _DURATION = _number(0.0, 1e6)
 _POSITIVE = _number(0.0, 1e6, above=True)
 
@@ -178,6 +197,20 @@ class SourceConfig:
     motion: Motion = _setting(Motion("cv", 1.0), lambda v: _build(Motion, v), "motion of its tracks")
     may_start: bool = _setting(True, _flag, "its tracks may start global tracks")
     height: Height = _setting(Height(), lambda v: _build(Height, v), "height of what a 2-D source sees, m")
+    stale: float | None = _setting(
+        None, _maybe(_POSITIVE), "seconds after which its tracks are stale; left out: stale_periods and lateness"
+    )
+    coverage: Coverage | None = _setting(
+        None, _maybe(_coverage), "its field of view, e.g. {kind = 'disk', radius = 20000}; left out: not known"
+    )
+    detection_probability: float | None = _setting(
+        None, _maybe(_number(0, 1)), "that an object in its coverage is detected in one scan; left out: not known"
+    )
+    initiation_delay: float | None = _setting(
+        None, _maybe(_DURATION), "seconds from entry into its coverage to a first track"
+    )
+    covariance_floor: float = _setting(0.0, _DURATION, "sigma added to its positions, m")
+    inflation: float = _setting(1.0, _number(0, 1e6, above=True), "factor on its covariances")
     override: bool = _setting(False, _flag, "use these values even where its SensorInfo says otherwise")
     ignore: bool = _setting(False, _flag, "refuse all it sends (reason: muted)")
 
@@ -191,7 +224,8 @@ class CentreConfig:
     space: tuple[str, ...] = _setting(
         ("x", "y", "vx", "vy"), _parsed(check_space, _texts), "state space of the picture"
     )
-    frame: Frame | None = _setting(None, _frame, "frame of the picture; left out: that of the first source taken")
+    frame: Frame | None = _setting(None, _frame, "frame of the picture; left out: what sources agree on")
+    frame_wait: float = _setting(5.0, _DURATION, "seconds after which the most supported frame is taken")
     clock: str = _setting("wall", _choice("wall", "message"), "step by wall clock, or by the messages' own time")
     period: float = _setting(1.0, _number(0.01, 1e5), "seconds between steps")
     delay: float = _setting(0.5, _DURATION, "wall clock: how far behind now a step is")
@@ -221,7 +255,10 @@ class CentreConfig:
         0.0, _number(0, 1), "a track of less existence is tentative, or ends without support"
     )
     coast: float = _setting(5.0, _DURATION, "seconds a confirmed track lives on without support")
-    stale_periods: float = _setting(3.0, _number(1, 1e6), "a source (or track) is stale after so many periods")
+    stale_periods: float = _setting(
+        3.0, _number(1, 1e6), "a source (or track) is stale after so many of its own periods, and lateness"
+    )
+    remember: float = _setting(600.0, _DURATION, "seconds for which a stale track's id and interval are remembered")
     intensity_rule: str = _setting(
         "hybrid",
         _choice("aa", "ga", "hybrid"),

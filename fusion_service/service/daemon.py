@@ -22,6 +22,7 @@ import msgpack
 from fusion_service.bus import Bus, Inbox, open_bus
 from fusion_service.centre import (
     Centre,
+    ClockSet,
     MessageClock,
     Order,
     Refused,
@@ -135,8 +136,6 @@ class Service:
             changed = self._note_tokens()
             self._note_drops()
             self._step_all(stop)
-            if self._message_clock is None:
-                self._warn_set_back()
             if (changed and self._allowed("status", 0.1)) or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
                 self._publish_status()
@@ -214,14 +213,11 @@ class Service:
             return
         if message.source != name:
             self._centre.handle(Refused(name, "source"), item.received)
-        elif (
-            self._message_clock is not None
-            and isinstance(message, (LocalTracks, LocalIntensity))
-            and not self._message_clock.admits(message, item.received)
-        ):
-            self._centre.handle(Refused(name, "future"), item.received)
-        else:
-            self._centre.handle(message, item.received)
+            return
+        fault = ""
+        if self._message_clock is not None and isinstance(message, (LocalTracks, LocalIntensity)):
+            fault = self._message_clock.fault(message, item.received)
+        self._centre.handle(Refused(name, fault) if fault else message, item.received)
 
     def _note_tokens(self) -> bool:
         """Tell the centre which sources came and went; whether any did."""
@@ -260,28 +256,19 @@ class Service:
             due = self._wall_clock.due(time.time_ns()) if self._message_clock is None else self._message_clock.due()
             if due is None:
                 return
+            if due <= self._centre.time:
+                self._centre.handle(ClockSet(due), time.time_ns())
             if due > self._centre.time:
                 self._step(due)
             else:
                 self._warn_behind(due)
 
-    def _warn_set_back(self) -> None:
-        """The wall clock stands before the last step: none can be made until it has caught up."""
-        seconds = self._wall_clock.behind(time.time_ns())
-        if seconds > self._config.centre.period:
-            self._counts["behind"] += 1
-            if self._allowed("set back", 10.0):
-                log.warning("the clock was set back: no step for another %.0f s", seconds)
-
     def _warn_behind(self, due: int) -> None:
-        """The messages' time is before the checkpoint's: no step can be made there again."""
+        """The clock stands before the last step: none is made until it has caught up, or a new era begins."""
         self._counts["behind"] += 1
-        words = (
-            "the messages are %.0f s before the last step of the checkpoint: to begin a mission anew, "
-            "stop the service and delete the folder %s"
-        )
+        words = "the clock is %.1f s before the last step, which waits for it: if it stays behind, a new era begins"
         if self._allowed(words, 10.0):
-            log.warning(words, (self._centre.time - due) / 1e9, self._config.service.state)
+            log.warning(words, (self._centre.time - due) / 1e9)
 
     def _step(self, at: int) -> None:
         begin = time.perf_counter()
@@ -293,6 +280,8 @@ class Service:
                 return
             result, data = again
         self._save()
+        if result.status.notes and self._allowed(result.status.notes[0], 600.0):
+            log.warning("%s", "; ".join(result.status.notes))
         self._result = result
         seconds = time.perf_counter() - begin
         self._counts["steps"] += 1
@@ -320,6 +309,7 @@ class Service:
         self._counts["failed_steps"] += 1
         self._loudly("the step at %d failed: what came in for it is dropped", at)
         self._restart()
+        self._centre.handle(ClockSet(at), time.time_ns())
         try:
             return self._make(at)
         except Exception:

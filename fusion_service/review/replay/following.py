@@ -20,6 +20,7 @@ from fusion_service.centre import (
     Centre,
     Event,
     MessageClock,
+    NewEra,
     Order,
     Refused,
     SourceFound,
@@ -81,8 +82,10 @@ class Player:
         try:
             for event in events:
                 centre.handle(event, at)
+            if at <= centre.time:
+                centre.handle(NewEra(at - 1), at)
             for one in inputs:
-                centre.handle(one.message, max(one.received, getattr(one.message, "time", 0), one.message.epoch))
+                centre.handle(one.message, max(one.received, getattr(one.message, "time", 0), one.message.epoch, at))
             result = centre.step(at)
         except Exception as error:  # a recording may hold anything
             return f"{type(error).__name__}: {error}"
@@ -258,6 +261,8 @@ def _events(log: StepLog) -> list[Event]:
         kind, source = event.get("kind"), event.get("source")
         if kind in ("found", "lost") and isinstance(source, str):
             events.append((SourceFound if kind == "found" else SourceLost)(source))
+        elif kind == "era" and isinstance(event.get("time"), int):
+            events.append(NewEra(event["time"]))
         elif kind == "order" and isinstance(event.get("what"), str) and isinstance(source, str):
             track = event.get("track")
             events.append(Order(event["what"], source, track if isinstance(track, int) else None))
@@ -280,10 +285,8 @@ class Clocked:
         for player, config, clock in zip(self._players, self._configs, self._clocks, strict=True):
             if player.centre is None:
                 player.begin(config, None, 1, received)
-            if isinstance(message, LocalTracks | LocalIntensity) and not clock.admits(message, received):
-                player.handle(Refused(message.source, "future"), received)
-            else:
-                player.handle(message, received)
+            fault = clock.fault(message, received) if isinstance(message, LocalTracks | LocalIntensity) else ""
+            player.handle(Refused(message.source, fault) if fault else message, received)
             self._step_all(player, clock, received)
         self._names.add(message.source)
 
