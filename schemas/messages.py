@@ -239,7 +239,8 @@ class StepLog(Header):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Status(Header):
-    """Health of a centre. Counters grow since its start; `sources` maps a name to its own small map."""
+    """Health of a centre. Counters grow since its start; `sources` maps a name to its own small map;
+    `notes` are sentences about the centre that an operator should read."""
 
     type: ClassVar[str] = "status"
     time: int
@@ -253,6 +254,7 @@ class Status(Header):
     tracks: dict[str, int]
     step_time: dict[str, float]
     memory: int | None = None
+    notes: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -3,6 +3,7 @@
 from fusion_service.centre.centre import Centre, StepResult
 from fusion_service.centre.checkpoint import CheckpointError
 from fusion_service.centre.clock import MessageClock, WallClock
+from fusion_service.centre.era import ClockSet, NewEra
 from fusion_service.centre.fusion import FusionCentre
 from fusion_service.centre.intake import Event, Order, Refused, SourceFound, SourceLost
 from fusion_service.centre.intensity import IntensityCentre
@@ -11,10 +12,12 @@ from fusion_service.centre.making import make_centre
 __all__ = [
     "Centre",
     "CheckpointError",
+    "ClockSet",
     "Event",
     "FusionCentre",
     "IntensityCentre",
     "MessageClock",
+    "NewEra",
     "Order",
     "Refused",
     "SourceFound",

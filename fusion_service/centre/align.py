@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.centre.intake import Intake
+from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
 from fusion_service.densities import Mixtures
@@ -24,7 +25,7 @@ PARTS = ("log_weight", "part_mean", "part_covariance")
 
 def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table, and
-    so does what has no sound density there (refused: ill-conditioned)."""
+    so does what has no sound density there (refused: ill-conditioned); what is not used, and why, is told."""
     config = intake.config
     parts: list[Tracks] = []
     index: list[NDArray[np.intp]] = []
@@ -34,11 +35,12 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     lost: list[NDArray[np.bool_]] = []
     origin: list[NDArray[np.int64]] = []
     kept: dict[str, int] = {}
+    room = MAX_TOTAL // max(len(intake.sources), 1)
     for number, (name, source) in enumerate(sorted(intake.sources.items())):
         said = intake.declared(source)
-        oldest = time - round(config.stale_periods * said.period * 1e9)
-        source.tracks = table = source.tracks.take(source.tracks.time >= oldest)
+        table = retire(source, said, time, room, config)
         if source.muted or not intake.ready(source):
+            leave_out(source)
             continue
         predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
@@ -51,7 +53,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         index.append(np.full(count, number, dtype=np.intp))
         epochs.append(np.full(count, source.epoch, dtype=np.uint64))
         starts.append(np.full(count, said.may_start, dtype=np.bool_))
-        interval.append(np.full(count, round(said.period * 1e9), dtype=np.int64))
+        interval.append(table.interval[sound])
         lost.append(np.full(count, source.alive is False, dtype=np.bool_))
         origin.append(np.full(count, ORIGINS.index(source.origin), dtype=np.int64))
     if not parts:

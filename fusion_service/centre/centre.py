@@ -16,10 +16,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import pack_state, unpack_state
+from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.intake import Event, Intake, Order
 from fusion_service.centre.journal import Journal, start_event
@@ -69,10 +71,12 @@ class Centre(ABC):
         self._published = 0
         self._time = -1
         self._journal = Journal(self.config.name, self.config_hash, __version__)
+        self._era = EraWatch(self.config)
         self._begin()
         if checkpoint is not None:
-            state, self._picture = unpack_state(checkpoint, self._intake, self.config.space)
+            state, self._picture = unpack_state(checkpoint, self._intake)
             self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
+            self._era.unpack(state["era"])
             self._restore(state)
         if generation is not None:
             self._ids.begin(generation)
@@ -80,13 +84,23 @@ class Centre(ABC):
 
     @property
     def time(self) -> int:
-        """Time of the newest step, ns; -1 before the first."""
+        """Time of the newest step, ns; -1 before the first. A new era may set it back (see `era`)."""
         return self._time
 
     def handle(self, event: Event, received: int) -> None:
         """Queue a message or another event for the next step; `received` is when it came, ns. Never raises
         for what a message contains: it is checked, and refused with a reason, in the step."""
-        self._intake.put(event, received)
+        era = self._era.judge(event, received, self._time)
+        if era is not None:
+            self._begin_era(era, received)
+        if not isinstance(event, (ClockSet, NewEra)):
+            self._intake.put(event, received)
+
+    def _begin_era(self, time: int, now: int) -> None:
+        self._journal.event(self._era.begin(time, self._time))
+        self._time = time
+        self._intake.rebase(time, now)
+        self._picture = rebased(self._picture, GLOBAL_TIMES, time)
 
     def step(self, time: int) -> StepResult:
         """Make the step at `time`, ns, which must be after the last. `ValueError` if it is not."""
@@ -96,6 +110,9 @@ class Centre(ABC):
         journal = self._journal
         self._obey(self._intake.admit(time, self._time, journal))
         self._time = time
+        if self._intake.reframed:
+            self._intake.reframed = False
+            self._end_all(self._picture.id, "frame")
         rows = usable_rows(self._intake, time, journal)
         names = self._intake.names()
         journal.name_sources(names)
@@ -113,7 +130,7 @@ class Centre(ABC):
         )
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
-        status = step_status(self._intake, journal, log, self._numbers(), self.refusals())
+        status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), self._era.notes(time))
         return StepResult(tracks, log, status)
 
     def refusals(self) -> dict[str, int]:
@@ -127,6 +144,7 @@ class Centre(ABC):
             "step": self._step,
             "time": self._time,
             "next_id": self._ids.next,
+            "era": self._era.pack(),
             **self._kept(),
         }
         return pack_state(self.config_hash, state, self._intake, self._picture)
@@ -165,11 +183,15 @@ class Centre(ABC):
         doomed = [order.track for order in orders if order.what == "delete" and order.track is not None]
         doomed = [track for track in doomed if 0 < track < 2**64]
         if doomed:
-            gone = np.isin(self._picture.id, np.array(doomed, dtype=np.uint64))
-            for track in self._picture.id[gone].tolist():
-                self._journal.end(track, "ordered", None)
-            self._forget(self._picture.id[gone].tolist())
-            self._picture = self._picture.take(~gone)
+            self._end_all(np.array(doomed, dtype=np.uint64), "ordered")
+
+    def _end_all(self, tracks: NDArray[np.uint64], reason: str) -> None:
+        """End those of these global tracks that there are."""
+        gone = np.isin(self._picture.id, tracks)
+        for track in self._picture.id[gone].tolist():
+            self._journal.end(track, reason, None)
+        self._forget(self._picture.id[gone].tolist())
+        self._picture = self._picture.take(~gone)
 
     def _numbers(self) -> dict[str, int]:
         kinds = Counter(self._picture.status.tolist())

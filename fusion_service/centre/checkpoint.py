@@ -11,8 +11,12 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
+from fusion_service.centre.frames import Vote
+from fusion_service.centre.intervals import NOTHING_REMEMBERED, Remembered
 from fusion_service.centre.lifecycle import Picture, empty_picture
+from fusion_service.centre.restoring import fit_config
 from fusion_service.centre.sources import Source, Tracks, empty_tracks, padded
 from fusion_service.errors import FusionError
 from schemas import Ecef, Enu, Frame, Local, SensorInfo, decode, encode
@@ -25,8 +29,11 @@ __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"
 CHECKPOINT_VERSION = 2
 _PLAIN = (
     *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
-    *("origin", "waited", "highest", "first"),
+    *("origin", "waited", "highest", "first", "interval", "ordered", "why", "unused"),
 )
+_LATER = ("interval", "ordered", "why", "unused")
+"""What a checkpoint of an earlier release does not hold."""
+NO_ERA = (0, -1, -1, 0, -1, -1)
 Columns = TypeVar("Columns", Tracks, Picture)
 
 
@@ -41,6 +48,7 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, picture:
         "config_hash": config_hash,
         "kind": intake.config.kind,
         "frame": _pack_frame(intake.frame),
+        "frame_asked": intake.voting.asked,
         "sources": {name: _pack_source(source) for name, source in sorted(intake.sources.items())},
         "picture": _pack_columns(picture),
         **state,
@@ -48,8 +56,9 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, picture:
     return cast(bytes, msgpack.packb(whole))
 
 
-def unpack_state(blob: bytes, intake: Intake, space: tuple[str, ...]) -> tuple[dict[str, Any], Picture]:
-    """Fill the intake, and return the rest and the picture. `CheckpointError` if it does not fit this centre."""
+def unpack_state(blob: bytes, intake: Intake) -> tuple[dict[str, Any], Picture]:
+    """Fill the intake, and return the rest and the picture, in the space and frame of the config.
+    `CheckpointError` if it is of another kind of centre, or cannot be read."""
     try:
         whole = msgpack.unpackb(blob)
         version = whole["v"]
@@ -57,21 +66,20 @@ def unpack_state(blob: bytes, intake: Intake, space: tuple[str, ...]) -> tuple[d
             raise CheckpointError(f"the checkpoint is of version {version}, this is {CHECKPOINT_VERSION}")
         if whole.get("kind", "tracks") != intake.config.kind:
             raise CheckpointError(f"the checkpoint is of a centre that fuses {whole['kind']}, not {intake.config.kind}")
-        if tuple(whole["space"]) != space:
-            raise CheckpointError("the checkpoint is in another state space than the config")
-        frame = _unpack_frame(whole["frame"])
-        if intake.config.frame is not None and frame not in (None, intake.config.frame):
-            raise CheckpointError("the checkpoint is in another frame than the config")
+        was, frame = tuple(whole["space"]), _unpack_frame(whole["frame"])
         sources = {name: _unpack_source(name, packed) for name, packed in whole["sources"].items()}
-        picture = _unpack_columns(whole["picture"], empty_picture(len(space)))
+        picture = _unpack_columns(whole["picture"], empty_picture(len(was)))
+        picture = fit_config(sources, picture, was, frame, intake.config)
+        asked = int(whole.get("frame_asked", -1))
+        era = [int(part) for part in whole.get("era", NO_ERA)]
         numbers = {name: int(whole[name]) for name in ("step", "time", "next_id")}
-        evidence = {"merges": whole["merges"], "rivals": whole["rivals"]}
+        evidence = {"merges": whole["merges"], "rivals": whole["rivals"], "entries": whole["entries"]}
     except CheckpointError:
         raise
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
-    intake.frame, intake.sources = frame or intake.config.frame, sources
-    return {**numbers, **evidence}, picture
+    intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
+    return {**numbers, **evidence, "era": era}, picture
 
 
 def _pack_source(source: Source) -> dict[str, Any]:
@@ -80,6 +88,9 @@ def _pack_source(source: Source) -> dict[str, Any]:
     packed["seen"] = [list(key) for key in source.seen]
     packed["info"] = None if source.info is None else encode(source.info)
     packed["tracks"] = _pack_columns(source.tracks)
+    packed["remembered"] = [_bytes(column) for column in source.remembered]
+    if source.vote is not None:
+        packed["vote"] = [_pack_frame(source.vote.frame), list(source.vote.space), source.vote.time]
     return packed
 
 
@@ -87,7 +98,17 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
     space = tuple(packed["space"])
     source = Source(name, space, _unpack_columns(packed["tracks"], empty_tracks(len(space))))
     for plain in _PLAIN:
-        setattr(source, plain, packed[plain])
+        if plain in packed or plain not in _LATER:
+            setattr(source, plain, packed[plain])
+    if "ordered" in packed:
+        source.muted = bool(source.ordered)
+    if "remembered" in packed:
+        kinds = NOTHING_REMEMBERED
+        columns = (_array(one, like) for one, like in zip(packed["remembered"], kinds, strict=True))
+        source.remembered = Remembered(*columns)
+    if "vote" in packed:
+        spoken, names, time = packed["vote"]
+        source.vote = Vote(_unpack_frame(spoken) or Local("none"), tuple(names), time)
     source.seen = deque((kind, seq, code) for kind, seq, code in packed["seen"])
     source.seen_set = set(source.seen)
     if packed["info"] is not None:
@@ -101,9 +122,16 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
 def _pack_columns(columns: Tracks | Picture) -> dict[str, Any]:
     packed: dict[str, Any] = {"components": len(columns.log_weight)}
     for one in fields(columns):
-        array = getattr(columns, one.name)
-        packed[one.name] = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+        packed[one.name] = _bytes(getattr(columns, one.name))
     return packed
+
+
+def _bytes(array: NDArray[Any]) -> bytes:
+    return np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+
+
+def _array(packed: bytes, like: NDArray[Any]) -> NDArray[Any]:
+    return np.frombuffer(packed, dtype=like.dtype.newbyteorder("<")).astype(like.dtype)
 
 
 def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
@@ -112,7 +140,7 @@ def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
     arrays = []
     for one in fields(like):
         empty = getattr(like, one.name)
-        flat = np.frombuffer(packed[one.name], dtype=empty.dtype.newbyteorder("<")).astype(empty.dtype)
+        flat = np.zeros(count, empty.dtype) if one.name not in packed else _array(packed[one.name], empty)
         arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)
 

@@ -27,7 +27,6 @@ from fusion_service.centre.association import by_size
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import Source
 from fusion_service.config import SourceConfig
 from fusion_service.coverage import covers
 from fusion_service.densities import Mixtures, power_product
@@ -61,7 +60,7 @@ class Entries:
         if len(ids):
             at = np.minimum(np.searchsorted(ids, picture.id), len(ids) - 1)
             known = covered & (ids[at] == picture.id)
-            entered[known] = since[at[known]]
+            entered[known] = np.minimum(since[at[known]], time)
         self.by_source[name] = (picture.id[covered], entered[covered])
         return entered
 
@@ -99,16 +98,13 @@ def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entr
     opinion = np.where(picture.time < 0, _logit(config.birth_existence), picture.opinion)
     evidence = picture.evidence.copy()
     opinion, told = _opinions(rows, picture, inside[says], hit, opinion, config.existence)
-    names = intake.names()
-    declared = [intake.declared(intake.sources[name]) for name in names]
-    gain = np.array([_gain(one) for one in declared])
+    gain = np.array([_gain(intake.declared(intake.sources[name])) for name in intake.names()])
     counted = fresh & ~says
     np.add.at(evidence, at[counted], gain[rows.source[inside[counted]]])
-    opinion, evidence = np.where(told, opinion + 0.0, opinion), evidence
-    evidence = evidence + _missed(rows, picture, intake, declared, entries, time)
+    evidence = np.where(told, 0.0, evidence) + _missed(rows, picture, intake, entries, time)
     if before >= 0:
         quiet = ~hit & (picture.time >= 0)
-        r = _sigmoid(np.clip(opinion + evidence, -MOST, MOST)) * config.survival ** ((time - before) / 1e9)
+        r = _sigmoid(np.clip(opinion + evidence, -MOST, MOST)) * config.survival ** (max(time - before, 0) / 1e9)
         evidence = np.where(quiet, _logit(r) - opinion, evidence)
     total = np.clip(opinion + evidence, -MOST, MOST)
     return replace(picture, opinion=opinion, evidence=total - opinion, existence=_sigmoid(total))
@@ -154,16 +150,15 @@ def _gain(declared: SourceConfig) -> float:
     return float(np.log(max(p, declared.false_track) / declared.false_track))
 
 
-def _missed(
-    rows: Rows, picture: Picture, intake: Intake, declared: list[SourceConfig], entries: Entries, time: int
-) -> Floats:
+def _missed(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time: int) -> Floats:
     """What the scans of the step that show nothing new of a track add to its log-odds (G,)."""
     total = np.zeros(len(picture.id))
     frame = intake.frame
+    sensors = {name: intake.sensor(source) for name, source in sorted(intake.sources.items()) if not source.muted}
     looking = {
-        name: (source, said)
-        for (name, source), said in zip(sorted(intake.sources.items()), declared, strict=True)
-        if not source.muted and said.coverage is not None and said.detection_probability
+        name: said
+        for name, said in sensors.items()
+        if said is not None and said.coverage is not None and said.detection_probability
     }
     entries.keep(set(looking))
     if frame is None or not len(picture.id):
@@ -171,22 +166,17 @@ def _missed(
     places = [intake.config.space.index(axis) for axis in ("x", "y", "z") if axis in intake.config.space]
     index = {name: number for number, name in enumerate(intake.names())}
     new = rows.fresh | rows.tracks.outside
-    for name, (source, said) in looking.items():
-        covered = (picture.time >= 0) & covers(_seen_from(source, said), picture.mean[places], frame)
+    for name, said in looking.items():
+        covered = (picture.time >= 0) & covers(said, picture.mean[places], frame)
         entered = entries.note(name, picture, covered, time)
-        if not source.scans:
+        scans = intake.sources[name].scans
+        if not scans:
             continue
         told = rows.tracks.link[(rows.source == index[name]) & new]
         missed = covered & (time - entered >= said.initiation_delay * 1e9) & ~np.isin(picture.id, told)
         p = min(float(said.detection_probability or 0.0), MOST_CERTAIN)
-        total[missed] += source.scans * np.log1p(-p)
+        total[missed] += scans * np.log1p(-p)
     return total
-
-
-def _seen_from(source: Source, said: SourceConfig) -> Any:
-    """The source's word with the coverage that holds for it."""
-    assert source.info is not None
-    return replace(source.info, coverage=said.coverage)
 
 
 def _logit(r: Any) -> Any:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.align import predict_tracks, write_back
 from fusion_service.centre.centre import Centre
-from fusion_service.centre.existence import existence_now
+from fusion_service.centre.existence import Entries, update_existence
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.lifecycle import Picture, Support
 from fusion_service.centre.linking import Linker
@@ -36,12 +36,16 @@ class FusionCentre(Centre):
 
     def _begin(self) -> None:
         self._linker = Linker(self.config, self._ids)
+        self._entries = Entries()
+        self._last = -1
 
     def _kept(self) -> dict[str, Any]:
-        return self._linker.packed()
+        return {**self._linker.packed(), "entries": self._entries.packed()}
 
     def _restore(self, state: dict[str, Any]) -> None:
         self._linker.restore(state)
+        self._entries = Entries.unpacked(state["entries"])
+        self._last = self._time
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         self._associate(rows, time)
@@ -83,10 +87,10 @@ class FusionCentre(Centre):
         updated, newest = picture.updated.copy(), np.full(len(picture.id), -1, dtype=np.int64)
         np.maximum.at(updated, at, tracks.updated[inside])
         np.maximum.at(newest, at, tracks.time[inside])
-        fresh = newest > picture.seen
-        existence = existence_now(rows, picture, fresh, self._intake, time)
         seen = np.maximum(picture.seen, newest)
-        picture = replace(picture, updated=updated, existence=existence, seen=seen)
+        picture = replace(picture, updated=updated, seen=seen)
+        picture = update_existence(rows, picture, self._intake, self._entries, time, self._last)
+        self._last = time
         support = self._support(rows, inside, at, len(picture.id), time)
         picture, ended = live_on(picture, time, support, self.config, self._journal)
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))

@@ -66,7 +66,7 @@ class IntensityCentre(Centre):
         self._fused = self._nothing(0)
 
     def _kept(self) -> dict[str, Any]:
-        return {"merges": [], "rivals": []}
+        return {"merges": [], "rivals": [], "entries": []}
 
     def _restore(self, state: dict[str, Any]) -> None:
         """The intensity is fused anew in every step."""
@@ -199,7 +199,7 @@ class IntensityCentre(Centre):
         )
         slowest = np.max(np.where(supporting, period[:, None], 0), axis=0, initial=0)
         due = np.where(supporting.any(axis=0), time + slowest + np.maximum(slowest // 2, 10**9), -1)
-        support = Support(supporting.sum(axis=0), fresh, due, slowest, ~supporting.any(axis=0))
+        support = Support(supporting.sum(axis=0), fresh, due, slowest, np.asarray(~supporting.any(axis=0)))
         picture, ended = live_on(picture, time, support, self.config, self._journal)
         return picture.take(~ended), ended
 

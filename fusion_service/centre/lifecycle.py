@@ -33,7 +33,7 @@ class Picture:
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
     overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
-    existence; origin i64, the code of all that is in it.
+    existence, and opinion and evidence, the log-odds it is made of; origin i64, the code of all that is in it.
     """
 
     id: NDArray[np.uint64]
@@ -52,6 +52,8 @@ class Picture:
     hits: NDArray[np.uint64]
     last_hit: NDArray[np.int64]
     existence: NDArray[np.float64]
+    opinion: NDArray[np.float64]
+    evidence: NDArray[np.float64]
     origin: NDArray[np.int64]
 
     def take(self, rows: Any) -> Picture:
@@ -98,6 +100,8 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int, origin: NDArray[np.int64
         hits=np.zeros(count, dtype=np.uint64),
         last_hit=never,
         existence=np.ones(count),
+        opinion=np.zeros(count),
+        evidence=np.zeros(count),
         origin=np.zeros(count, dtype=np.int64) if origin is None else origin,
     )
 

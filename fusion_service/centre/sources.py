@@ -16,6 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, linalg
+from fusion_service.centre.frames import Vote
+from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
 from fusion_service.densities import Mixtures, reduce_mixtures
 from schemas import Frame, Height, LocalTracks, SensorInfo
 
@@ -66,6 +68,7 @@ class Tracks:
     Where some track is a mixture, parts (C > 0) hold its components, log_weight (C, T) with -inf for padding,
     part_mean (n, C, T), part_covariance (n, n, C, T), and mean and covariance are their moments; else C = 0.
     id u64; time i64 of the density; updated i64 of the last measurement; existence (NaN: not reported);
+    interval i64 expected time to the next report, ns (see `intervals`);
     link u64 global id or 0; since i64 step of the link; used i64 time of the version last fused (-1: none); judged
     i64 `updated` of the newest datum that was judged, seen i64 time of the step that did; weighed i64 newest datum of
     the others in the track when evidence was last added; data i64 how many were judged in this link; evidence f64 sum
@@ -82,6 +85,7 @@ class Tracks:
     part_covariance: NDArray[np.float64]
     existence: NDArray[np.float64]
     updated: NDArray[np.int64]
+    interval: NDArray[np.int64]
     link: NDArray[np.uint64]
     since: NDArray[np.int64]
     used: NDArray[np.int64]
@@ -112,7 +116,7 @@ def empty_tracks(n: int) -> Tracks:
     whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
     ids = np.zeros(0, dtype=np.uint64)
     moments, parts = (np.zeros((n, 0)), np.zeros((n, n, 0))), no_parts(n, 0)
-    return Tracks(ids, whole, *moments, *parts, real, whole, *_unlinked(0))
+    return Tracks(ids, whole, *moments, *parts, real, whole, whole, *_unlinked(0))
 
 
 def _unlinked(count: int) -> tuple[NDArray[Any], ...]:
@@ -199,6 +203,7 @@ def message_tracks(
         part_covariance=parts[2],
         existence=_gather(existence, sound).astype(np.float64),
         updated=np.minimum(_gather(updated, sound), times),
+        interval=np.zeros(len(times), dtype=np.int64),
         **dict(zip(LINKS, _unlinked(len(times)), strict=True)),
     )
 
@@ -235,7 +240,13 @@ def newest(old: Tracks, new: Tracks) -> Tracks:
 
 @dataclass(slots=True)
 class Source:
-    """State of one source. Times are ns; -1 means never."""
+    """State of one source. Times are ns; -1 means never.
+
+    interval: between its scans, ns, measured (-1: not yet). remembered: its tracks that went stale. vote: the frame it
+    speaks in. ordered: what an order last said about its being muted. why: the reason that data of it are not used, in
+    a sentence; unused: tracks that were not, by reason. Of the step being made: arrived, the ids that came; ahead, the
+    time of the newest message that is for a later one.
+    """
 
     name: str
     space: tuple[str, ...]
@@ -254,6 +265,14 @@ class Source:
     repeats: int = 0
     gaps: int = 0
     reordered: int = 0
+    interval: int = -1
+    remembered: Remembered = NOTHING_REMEMBERED
+    vote: Vote | None = None
+    ordered: bool | None = None
+    why: str = ""
+    unused: dict[str, int] = field(default_factory=dict)
+    arrived: list[NDArray[np.uint64]] = field(default_factory=list)
+    ahead: int = -1
     highest: dict[str, int] = field(default_factory=dict)
     first: dict[str, int] = field(default_factory=dict)
     seen: deque[tuple[str, int, int]] = field(default_factory=deque)
@@ -263,7 +282,13 @@ class Source:
         """Forget the last run: tracks, links, sequence."""
         self.epoch, self.info, self.waited, self.last, self.complete = epoch, None, 0, -1, -1
         self.tracks = empty_tracks(len(self.space))
+        self.interval, self.remembered, self.why, self.arrived = -1, NOTHING_REMEMBERED, "", []
         self.highest, self.first, self.seen, self.seen_set = {}, {}, deque(), set()
+
+    def leave(self, reason: str, count: int) -> None:
+        """Count tracks that are taken but not used."""
+        if count:
+            self.unused[reason] = self.unused.get(reason, 0) + count
 
     def is_repeat(self, kind: str, seq: int, digest: int) -> bool:
         """Whether this very message was taken before."""
@@ -287,12 +312,13 @@ class Source:
         if len(self.seen) > REMEMBERED:
             self.seen_set.discard(self.seen.popleft())
 
-    def apply(self, messages: Sequence[LocalTracks], new: Tracks, most: int) -> bool:
+    def apply(self, messages: Sequence[LocalTracks], new: Tracks, most: int, pace: Pace) -> bool:
         """Take the tracks of a complete scan, or of partial ones in a row; what a complete scan does not list is
         gone. False, and nothing is changed, if there would be more than `most` tracks."""
         space, complete = messages[-1].space, messages[-1].complete
         new = new.take(new.time >= self.complete)
         old = self.tracks if space == self.space else empty_tracks(len(space))
+        new = replace(new, interval=intervals(new.id, new.time, self._known(old), pace))
         merged = newest(old, new)
         end = messages[-1].time
         if complete and end >= self.complete:
@@ -303,6 +329,19 @@ class Source:
         if complete:
             self.scans += end >= self.complete
             self.complete = max(self.complete, end)
-        self.last = max(self.last, *(message.time for message in messages))
+        self.arrived.append(new.id)
+        for message in messages:
+            if 0 <= self.last < message.time:
+                gap = message.time - self.last
+                self.interval = follow(self.interval if self.interval > 0 else gap, gap, pace)
+            self.last = max(self.last, message.time)
         self.space, self.tracks = space, merged
         return True
+
+    def _known(self, tracks: Tracks) -> Remembered:
+        """The intervals of `tracks` and of what is remembered, sorted by id."""
+        there = Remembered(tracks.id, tracks.time, tracks.interval)
+        if not len(self.remembered.id):
+            return there
+        both = Remembered(*(np.concatenate(pair) for pair in zip(there, self.remembered, strict=True)))
+        return both.take(np.argsort(both.id, kind="stable"))

@@ -27,6 +27,7 @@ from fusion_service.config.readers import (
     maybe,
     number,
     parsed,
+    read_coverage,
     read_frame,
     read_mixture_rule,
     read_rule,
@@ -36,7 +37,7 @@ from fusion_service.config.readers import (
     whole,
 )
 from fusion_service.errors import FusionError
-from schemas import Frame, Height, Motion, check_name, check_realm, check_space
+from schemas import Coverage, Frame, Height, Motion, check_name, check_realm, check_space
 
 __all__ = ["BusConfig", "CentreConfig", "ConfigError", "DaemonConfig", "ServiceConfig", "SourceConfig", "config_hash"]
 
@@ -67,6 +68,21 @@ class SourceConfig:
     motion: Motion = _setting(Motion("cv", 1.0), lambda v: build(Motion, v), "motion of its tracks")
     may_start: bool = _setting(True, flag, "its tracks may start global tracks")
     height: Height = _setting(Height(), lambda v: build(Height, v), "height of what a 2-D source sees, m")
+    stale: float | None = _setting(
+        None, maybe(POSITIVE), "seconds after which its tracks are stale; left out: stale_periods and lateness"
+    )
+    coverage: Coverage | None = _setting(
+        None, maybe(read_coverage), "its field of view, e.g. {kind = 'disk', radius = 20000}; left out: not known"
+    )
+    detection_probability: float | None = _setting(
+        None, maybe(number(0, 1)), "that an object in its coverage is detected in one scan; left out: not known"
+    )
+    initiation_delay: float | None = _setting(
+        None, maybe(DURATION), "seconds from entry into its coverage to a first track"
+    )
+    false_track: float = _setting(0.1, number(1e-6, 1), "chance that a report of a track of it is of nothing")
+    covariance_floor: float = _setting(0.0, DURATION, "sigma added to its positions, m")
+    inflation: float = _setting(1.0, number(0, 1e6, above=True), "factor on its covariances")
     override: bool = _setting(False, flag, "use these values even where its SensorInfo says otherwise")
     ignore: bool = _setting(False, flag, "refuse all it sends (reason: muted)")
 
@@ -78,7 +94,8 @@ class CentreConfig:
     name: str = _setting("centre", parsed(check_name), "name of this centre in its keys")
     kind: str = _setting("tracks", choice("tracks", "intensity"), "what it takes from its sources and fuses")
     space: tuple[str, ...] = _setting(("x", "y", "vx", "vy"), parsed(check_space, texts), "state space of the picture")
-    frame: Frame | None = _setting(None, read_frame, "frame of the picture; left out: that of the first source taken")
+    frame: Frame | None = _setting(None, read_frame, "frame of the picture; left out: what sources agree on")
+    frame_wait: float = _setting(5.0, DURATION, "seconds after which the most supported frame is taken")
     clock: str = _setting("wall", choice("wall", "message"), "step by wall clock, or by the messages' own time")
     period: float = _setting(1.0, number(0.01, 1e5), "seconds between steps")
     delay: float = _setting(0.5, DURATION, "wall clock: how far behind now a step is")
@@ -107,13 +124,18 @@ class CentreConfig:
     min_sources: int = _setting(1, whole(1, 255), "sources that a track needs to be confirmed")
     confirm_sources: int = _setting(2, whole(1, 64), "so many sources in one step confirm a track at once")
     confirm_existence: float = _setting(0.0, number(0, 1), "existence needed to be confirmed")
+    birth_existence: float = _setting(0.5, number(1e-6, 1 - 1e-6), "existence of a new track before its first report")
+    survival: float = _setting(0.99, number(1e-6, 1), "chance that a target without reports is there a second later")
     existence: str = _setting("consistent", choice("consistent", "average", "geometric"), "how existence is fused")
     min_existence: float = _setting(
         0.0, number(0, 1), "a track of less existence is tentative, or ends without support"
     )
     coast: float = _setting(5.0, DURATION, "seconds a confirmed track lives on when its reports are overdue ...")
     coast_periods: float = _setting(3.0, number(0, 1e3), "... or so many of its source's periods, if that is longer")
-    stale_periods: float = _setting(3.0, number(1, 1e6), "a source (or track) is stale after so many periods")
+    stale_periods: float = _setting(
+        3.0, number(1, 1e6), "a source (or track) is stale after so many of its own periods, and lateness"
+    )
+    remember: float = _setting(600.0, DURATION, "seconds for which a stale track's id and interval are remembered")
     intensity_rule: str = _setting(
         "hybrid",
         choice("aa", "ga", "hybrid"),

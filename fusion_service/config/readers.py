@@ -13,7 +13,8 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
-from schemas import Ecef, Enu, Frame, Local
+from schemas import Coverage, Disk, Ecef, Enu, Frame, Local, Polygon, Sector
+from schemas.values import coverage
 
 __all__ = [
     "DURATION",
@@ -25,6 +26,7 @@ __all__ = [
     "maybe",
     "number",
     "parsed",
+    "read_coverage",
     "read_frame",
     "read_mixture_rule",
     "read_rule",
@@ -138,6 +140,11 @@ def build(kind: type[T], value: Any) -> T:
         if known[name] == "str" and not isinstance(one, str):
             raise ValueError(f"{name} is {one!r}, must be a text")
     return kind(**given)
+
+
+def read_coverage(value: Any) -> Coverage:
+    """A field of view as SensorInfo has it, or a table of its parts."""
+    return value if isinstance(value, (Disk, Sector, Polygon)) else coverage(table(value))
 
 
 def read_frame(value: Any) -> Frame | None:

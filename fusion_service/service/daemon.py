@@ -14,7 +14,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from fusion_service.bus import Bus, Inbox, open_bus
-from fusion_service.centre import MessageClock, Order, Refused, SourceFound, SourceLost, StepResult, WallClock
+from fusion_service.centre import ClockSet, MessageClock, Order, Refused, SourceFound, SourceLost, StepResult, WallClock
 from fusion_service.config import ServiceConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.notify import notify
@@ -82,8 +82,6 @@ class Service:
             changed = self._note_tokens()
             self._note_drops()
             self._step_all(stop)
-            if self._message_clock is None:
-                self._warn_set_back()
             if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
                 self._publish_status()
@@ -146,14 +144,11 @@ class Service:
             return
         if message.source != name:
             self._lasting.handle(Refused(name, "source"), item.received)
-        elif (
-            self._message_clock is not None
-            and isinstance(message, (LocalTracks, LocalIntensity))
-            and not self._message_clock.admits(message, item.received)
-        ):
-            self._lasting.handle(Refused(name, "future"), item.received)
-        else:
-            self._lasting.handle(message, item.received)
+            return
+        fault = ""
+        if self._message_clock is not None and isinstance(message, (LocalTracks, LocalIntensity)):
+            fault = self._message_clock.fault(message, item.received)
+        self._lasting.handle(Refused(name, fault) if fault else message, item.received)
 
     def _note_tokens(self) -> bool:
         """Tell the centre which sources came and went; whether any did."""
@@ -181,32 +176,27 @@ class Service:
             due = self._wall_clock.due(time.time_ns()) if self._message_clock is None else self._message_clock.due()
             if due is None:
                 return
+            if due <= self._lasting.centre.time:
+                self._lasting.handle(ClockSet(due), time.time_ns())
             if due > self._lasting.centre.time:
                 self._step(due)
             else:
                 self._warn_behind(due)
 
-    def _warn_set_back(self) -> None:
-        """The wall clock stands before the last step: none can be made until it has caught up."""
-        seconds = self._wall_clock.behind(time.time_ns())
-        if seconds > self._config.centre.period:
-            self._counts["behind"] += 1
-            self._told.warn("the clock was set back: no step for another %.0f s", seconds)
-
     def _warn_behind(self, due: int) -> None:
-        """The messages' time is before the checkpoint's: no step can be made there again."""
+        """The clock stands before the last step: none is made until it has caught up, or a new era begins."""
         self._counts["behind"] += 1
-        words = (
-            "the messages are %.0f s before the last step of the checkpoint: to begin a mission anew, "
-            "stop the service and delete the folder %s"
-        )
-        self._told.warn(words, (self._lasting.centre.time - due) / 1e9, self._config.service.state)
+        words = "the clock is %.1f s before the last step, which waits for it: if it stays behind, a new era begins"
+        self._told.warn(words, (self._lasting.centre.time - due) / 1e9)
 
     def _step(self, at: int) -> None:
         begin = time.perf_counter()
         made = self._lasting.step(at)
         if made is None:
             return
+        notes = made.result.status.notes
+        if notes and self._told.allows(notes[0], 600.0):
+            log.warning("%s", "; ".join(notes))
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._picture = made.messages["tracks"]

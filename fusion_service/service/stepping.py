@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fusion_service.centre import Centre, Event, Order, StepResult, make_centre
+from fusion_service.centre import Centre, ClockSet, Event, Order, StepResult, make_centre
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.state import State, StateError
@@ -104,6 +104,7 @@ class LastingCentre:
         self._counts["failed_steps"] += 1
         self._told.error("the step at %d failed: what came in for it is dropped", at)
         self._restart()
+        self.centre.handle(ClockSet(at), time.time_ns())
         try:
             return self._make(at)
         except Exception:

@@ -136,6 +136,8 @@ class Story:
             if kind == "start":
                 kept = "checkpoint" in event or "left_out" in event
                 self.say(at, f"the service began anew {'from its checkpoint' if kept else 'without a checkpoint'}")
+            elif kind == "era":
+                self.say(at, "the clock was set back: a new era began")
             elif kind in ("found", "lost") and source in sources:
                 self.say(at, f"{source} {'is on the bus' if kind == 'found' else 'has left the bus'}")
             elif kind == "order" and event.get("track") == self.track:

@@ -36,8 +36,9 @@ class ClockEngine:
         for player, config, clock in zip(self._players, self._configs, self._clocks, strict=True):
             if player.centre is None:
                 player.begin(config, None, 1, received)
-            if isinstance(message, LocalTracks | LocalIntensity) and not clock.admits(message, received):
-                player.handle(Refused(message.source, "future"), received)
+            fault = clock.fault(message, received) if isinstance(message, LocalTracks | LocalIntensity) else ""
+            if fault:
+                player.handle(Refused(message.source, fault), received)
             else:
                 player.handle(message, received)
             self._step_all(player, clock, received)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 
-from fusion_service.centre import Centre, Event, StepResult, make_centre
+from fusion_service.centre import Centre, Event, NewEra, StepResult, make_centre
 from fusion_service.config import CentreConfig
 from fusion_service.review.replay.inputs import Input
 from fusion_service.review.replay.variants import Variant
@@ -49,8 +49,10 @@ class Player:
         try:
             for event in events:
                 centre.handle(event, at)
+            if at <= centre.time:
+                centre.handle(NewEra(at - 1), at)
             for one in inputs:
-                centre.handle(one.message, max(one.received, getattr(one.message, "time", 0), one.message.epoch))
+                centre.handle(one.message, max(one.received, getattr(one.message, "time", 0), one.message.epoch, at))
             result = centre.step(at)
         except Exception as error:  # a recording may hold anything
             return f"{type(error).__name__}: {error}"
