@@ -1,6 +1,7 @@
 """Does a global track exist: a Bernoulli filter over what its sources report, see and do not see.
 
-In log-odds, existence is an opinion and the evidence since: logit r = opinion + evidence, bounded by `MOST`.
+In log-odds, existence is an opinion, the evidence for it and what was missed: logit r = opinion + evidence + misses,
+each and their sum bounded by `MOST`.
 
 * Birth: the opinion is that of `birth_existence`.
 * A source that reports existence gives an opinion, not evidence: whenever one brings new data, the opinion becomes the
@@ -11,14 +12,15 @@ In log-odds, existence is an opinion and the evidence since: logit r = opinion +
   `false_track`, the chance that a report of a track of it is of nothing.
 * A complete scan of a source that covers the place and has no new datum of the track is evidence, log(1 - p), once per
   scan received (the Bernoulli filter's r' = r (1 - p) / (1 - r p)), after the track has been in its coverage for its
-  initiation delay. Where coverage or detection probability is not declared, nothing is lowered.
+  initiation delay, and until it sees the track. Where coverage or detection probability is not declared, nothing is
+  lowered.
 * Without any new datum the target may be gone: r' = r s^dt, s the `survival` of a second.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,42 +49,56 @@ MOST_OVERLAPPING = 32
 """Beyond so many sources the overlap is not worked out, and existence is fused by the consistent rule."""
 
 
+class Misses(NamedTuple):
+    """What one source has not seen of K global tracks: ids, sorted; since i64 ns when each came into its coverage, -1
+    where it is not in it; total f64, the log-odds that its scans without the track have added."""
+
+    ids: NDArray[np.uint64]
+    since: NDArray[np.int64]
+    total: Floats
+
+
 @dataclass(slots=True)
 class Entries:
-    """When each global track came into the coverage of each source: by name the ids (K,), sorted, and times (K,) ns."""
+    """The `Misses` of every source, by name."""
 
-    by_source: dict[str, tuple[NDArray[np.uint64], NDArray[np.int64]]] = field(default_factory=dict)
+    by_source: dict[str, Misses] = field(default_factory=dict)
 
-    def note(self, name: str, picture: Picture, covered: Bools, time: int) -> NDArray[np.int64]:
-        """The time (G,) since when each track is covered, `time` for one that was not before and for others."""
-        ids, since = self.by_source.get(name, (picture.id[:0], picture.time[:0]))
-        entered = np.full(len(picture.id), time, dtype=np.int64)
-        if len(ids):
-            at = np.minimum(np.searchsorted(ids, picture.id), len(ids) - 1)
-            known = covered & (ids[at] == picture.id)
-            entered[known] = np.minimum(since[at[known]], time)
-        self.by_source[name] = (picture.id[covered], entered[covered])
-        return entered
+    def of(self, name: str, picture: Picture) -> tuple[NDArray[np.int64], Floats]:
+        """since and total (G,) of the tracks of the picture."""
+        since, total = np.full(len(picture.id), -1, dtype=np.int64), np.zeros(len(picture.id))
+        known = self.by_source.get(name)
+        if known is not None and len(known.ids):
+            at = np.minimum(np.searchsorted(known.ids, picture.id), len(known.ids) - 1)
+            there = known.ids[at] == picture.id
+            since[there], total[there] = known.since[at[there]], known.total[at[there]]
+        return since, total
 
-    def keep(self, names: set[str]) -> None:
-        """Forget all other sources."""
+    def keep(self, name: str, picture: Picture, since: NDArray[np.int64], total: Floats) -> None:
+        """Remember these of the tracks of the picture."""
+        some = (since >= 0) | (total < 0)
+        self.by_source[name] = Misses(picture.id[some], since[some], total[some])
+
+    def forget_others(self, names: set[str]) -> None:
+        """Forget all sources but these."""
         self.by_source = {name: kept for name, kept in self.by_source.items() if name in names}
 
     def packed(self) -> list[Any]:
         """As plain values, in order."""
         return [
-            [name, ids.astype("<u8").tobytes(), since.astype("<i8").tobytes()]
-            for name, (ids, since) in sorted(self.by_source.items())
+            [name, *(np.ascontiguousarray(part, part.dtype.newbyteorder("<")).tobytes() for part in misses)]
+            for name, misses in sorted(self.by_source.items())
         ]
 
     @classmethod
     def unpacked(cls, packed: list[Any]) -> Entries:
         """From what `packed` gave."""
         made = cls()
-        for name, ids, since in packed:
-            made.by_source[str(name)] = (
+        for name, ids, since, total in packed:
+            made.by_source[str(name)] = Misses(
                 np.frombuffer(ids, "<u8").astype(np.uint64),
                 np.frombuffer(since, "<i8").astype(np.int64),
+                np.frombuffer(total, "<f8").astype(np.float64),
             )
         return made
 
@@ -97,24 +113,23 @@ def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entr
     hit = np.bincount(at[fresh], minlength=count) > 0
     opinion = np.where(picture.time < 0, _logit(config.birth_existence), picture.opinion)
     evidence = picture.evidence.copy()
-    opinion, told = _opinions(rows, picture, inside[says], hit, opinion, config.existence)
+    opinion = _opinions(rows, picture, inside[says], opinion, config.existence)
     gain = np.array([_gain(intake.declared(intake.sources[name])) for name in intake.names()])
     counted = fresh & ~says
     np.add.at(evidence, at[counted], gain[rows.source[inside[counted]]])
-    evidence = np.where(told, 0.0, evidence) + _missed(rows, picture, intake, entries, time)
+    missed = _missed(rows, picture, intake, entries, time)
+    evidence = np.clip(opinion + evidence, -MOST, MOST) - opinion
     if before >= 0:
         quiet = ~hit & (picture.time >= 0)
-        r = _sigmoid(np.clip(opinion + evidence, -MOST, MOST)) * config.survival ** (max(time - before, 0) / 1e9)
-        evidence = np.where(quiet, _logit(r) - opinion, evidence)
-    total = np.clip(opinion + evidence, -MOST, MOST)
-    return replace(picture, opinion=opinion, evidence=total - opinion, existence=_sigmoid(total))
+        r = _sigmoid(opinion + evidence) * config.survival ** (max(time - before, 0) / 1e9)
+        evidence = np.where(quiet, np.clip(_logit(r), -MOST, MOST) - opinion, evidence)
+    total = np.clip(opinion + evidence + missed, -MOST, MOST)
+    return replace(picture, opinion=opinion, evidence=evidence, existence=_sigmoid(total))
 
 
-def _opinions(
-    rows: Rows, picture: Picture, saying: NDArray[np.intp], hit: Bools, opinion: Floats, method: str
-) -> tuple[Floats, Bools]:
-    """The opinion of all sources that report existence, where one has new data; and where that is."""
-    opinion, told = opinion.copy(), np.zeros(len(picture.id), dtype=np.bool_)
+def _opinions(rows: Rows, picture: Picture, saying: NDArray[np.intp], opinion: Floats, method: str) -> Floats:
+    """The opinion of all sources that report existence, made anew where one has new data."""
+    opinion = opinion.copy()
     new = np.zeros(len(picture.id), dtype=np.bool_)
     new[picture.find(rows.tracks.link[saying[rows.fresh[saying]]])] = True
     for ids, members in by_size(rows.tracks.link[saying]):
@@ -122,8 +137,7 @@ def _opinions(
         some = new[at]
         if some.any():
             opinion[at[some]] = _logit(_fused(rows, saying[members[some]], method))
-            told[at[some]] = True
-    return opinion, told
+    return opinion
 
 
 def _fused(rows: Rows, members: NDArray[np.intp], method: str) -> Floats:
@@ -151,8 +165,9 @@ def _gain(declared: SourceConfig) -> float:
 
 
 def _missed(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time: int) -> Floats:
-    """What the scans of the step that show nothing new of a track add to its log-odds (G,)."""
-    total = np.zeros(len(picture.id))
+    """What all scans that show nothing new of a track, so far, take from its log-odds (G,). What a source has missed
+    is forgiven when it sees the track."""
+    whole = np.zeros(len(picture.id))
     frame = intake.frame
     sensors = {name: intake.sensor(source) for name, source in sorted(intake.sources.items()) if not source.muted}
     looking = {
@@ -160,23 +175,25 @@ def _missed(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time
         for name, said in sensors.items()
         if said is not None and said.coverage is not None and said.detection_probability
     }
-    entries.keep(set(looking))
+    entries.forget_others(set(looking))
     if frame is None or not len(picture.id):
-        return total
+        return whole
     places = [intake.config.space.index(axis) for axis in ("x", "y", "z") if axis in intake.config.space]
     index = {name: number for number, name in enumerate(intake.names())}
-    new = rows.fresh | rows.tracks.outside
     for name, said in looking.items():
+        since, total = entries.of(name, picture)
         covered = (picture.time >= 0) & covers(said, picture.mean[places], frame)
-        entered = entries.note(name, picture, covered, time)
-        scans = intake.sources[name].scans
-        if not scans:
-            continue
-        told = rows.tracks.link[(rows.source == index[name]) & new]
-        missed = covered & (time - entered >= said.initiation_delay * 1e9) & ~np.isin(picture.id, told)
+        since = np.where(covered, np.where(since >= 0, np.minimum(since, time), time), -1)
+        mine = rows.source == index[name]
+        seen = np.isin(picture.id, rows.tracks.link[mine & rows.fresh & ~rows.tracks.outside])
+        unsure = np.isin(picture.id, rows.tracks.link[mine & rows.tracks.outside])
+        missed = covered & ~seen & ~unsure & (time - since >= said.initiation_delay * 1e9)
         p = min(float(said.detection_probability or 0.0), MOST_CERTAIN)
-        total[missed] += scans * np.log1p(-p)
-    return total
+        more = intake.sources[name].scans * np.log1p(-p)
+        total = np.where(seen, 0.0, np.maximum(np.where(missed, total + more, total), -MOST))
+        entries.keep(name, picture, since, total)
+        whole = whole + total
+    return whole
 
 
 def _logit(r: Any) -> Any:
