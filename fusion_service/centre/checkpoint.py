@@ -70,7 +70,7 @@ def unpack_state(blob: bytes, intake: Intake, space: tuple[str, ...]) -> tuple[d
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources = frame or intake.config.frame, sources
-    return {**numbers, "agreeing": agreeing}, picture
+    return {**numbers, "agreeing": agreeing, "following": whole.get("following")}, picture
 
 
 def _pack_source(source: Source) -> dict[str, Any]:

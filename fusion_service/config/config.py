@@ -179,6 +179,9 @@ class SourceConfig:
     may_start: bool = _setting(True, _flag, "its tracks may start global tracks")
     height: Height = _setting(Height(), lambda v: _build(Height, v), "height of what a 2-D source sees, m")
     override: bool = _setting(False, _flag, "use these values even where its SensorInfo says otherwise")
+    registration_sigma: float = _setting(
+        0.0, _number(0.0, 1e5), "kind = intensity: m, error common to all it reports; SensorInfo: position_covariance"
+    )
     ignore: bool = _setting(False, _flag, "refuse all it sends (reason: muted)")
 
 
@@ -234,6 +237,9 @@ class CentreConfig:
         "threshold", _choice("threshold", "rank"), "tracks: components above the threshold, or the round(mass) heaviest"
     )
     intensity_threshold: float = _setting(0.5, _number(0, 1), "weight above which a component is a track")
+    intensity_count_error: float = _setting(
+        0.1, _number(1e-9, 0.5), "rate of error at which a place gets another number of tracks than it has"
+    )
     intensity_prune: float = _setting(1e-3, _number(0, 1), "weight below which a component is dropped")
     intensity_merge: float = _setting(2.0, _number(0, 100), "d2 below which components of one mixture are merged")
     intensity_components: int = _setting(500, _whole(1, 5000), "components kept at most")
