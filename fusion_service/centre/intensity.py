@@ -45,6 +45,8 @@ Bools = NDArray[np.bool_]
 SUPPORT = 0.5
 """What a source must have of the mean share in a component, of those that have any, to support its track."""
 MOST_TRACKS = 20_000
+MOST_AT_ONE = 20
+"""Tracks that one component carries: with more targets in one place, another track says nothing."""
 
 
 class IntensityCentre(Centre):
@@ -169,7 +171,7 @@ class IntensityCentre(Centre):
 
     def _candidates(self, memory: Memory, news: bool) -> Bools:
         """Which components (C,) may be states, and for extraction by rank how many states there are in all."""
-        config, weight = self.config, self._fused.weight
+        config, weight = self.config, np.minimum(self._fused.weight, MOST_AT_ONE)
         if config.intensity_extract == "threshold":
             return weight > config.intensity_threshold
         mass = np.array([self._fused.mass])
@@ -189,10 +191,11 @@ class IntensityCentre(Centre):
         """The component (G,) of each track, -1 for none; how many each component (C,) carries, and the evidence for
         more (C,); and the weight (G,) near each track that no state has."""
         fused, count, error = self._fused, len(picture.id), self.config.intensity_count_error
+        weight = np.minimum(fused.weight, MOST_AT_ONE)
         i, j, cost = self._near(picture)
         candidate = self._candidates(memory, bool(new.any()))
         may = candidate[j]
-        place = assign(i[may], j[may], cost[may], memory, fused.weight)
+        place = assign(i[may], j[may], cost[may], memory, weight)
         standing = np.flatnonzero((place >= 0) & memory.held)
         held = np.bincount(place[standing], minlength=len(candidate))
         where, first = np.unique(place[standing], return_index=True)
@@ -200,15 +203,15 @@ class IntensityCentre(Centre):
         lean[where] = memory.lean[standing[first]]
         fresh = (fused.share[new] > 0).any(axis=0)
         if self.config.intensity_extract == "rank":
-            number = ranked(np.where(candidate, fused.weight, 0.0), held, self._total)
+            number = ranked(np.where(candidate, weight, 0.0), held, self._total)
         else:
-            moved, leaned = next_number(held, lean, fused.weight, error)
+            moved, leaned = next_number(held, lean, weight, error)
             lean = np.where(fresh & (moved >= 1), leaned, np.where(fresh, 0.0, lean))
-            first_number = np.floor(fused.weight + 0.5).astype(np.intp)
+            first_number = np.floor(weight + 0.5).astype(np.intp)
             number = np.where(held > 0, np.where(fresh, moved, held), first_number)
             number = np.where(candidate, np.maximum(number, 1), 0)
         lean = np.where((held > 0) & (number > 0), lean, 0.0)
-        nearby = np.bincount(i, np.maximum(fused.weight - number, 0.0)[j], count)
+        nearby = np.bincount(i, np.maximum(weight - number, 0.0)[j], count)
         return carried(place, number, memory), number, lean, np.minimum(nearby, 1.0)
 
     def _near(self, picture: Picture) -> tuple[Ints, Ints, Floats]:

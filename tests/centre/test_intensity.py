@@ -495,6 +495,35 @@ def test_the_evidence_for_a_number_is_in_the_checkpoint() -> None:
     assert told == [1, 1, 2] * 2
 
 
+def test_names_of_sources_do_not_matter() -> None:
+    """The same reports under other names, hence in another order: the same places and numbers, to rounding."""
+    said = {"a": (3, Disk(9000.0), 0.7, SITE), "b": (2, None, None, None), "c": (1, Disk(6000.0), 0.9, None)}
+    pictures = []
+    for names in (("a", "b", "c"), ("c", "a", "b"), ("b", "c", "a")):
+        one = centre(())
+        for name, (count, coverage, p, covariance) in zip(names, said.values(), strict=True):
+            give(one, info(name, coverage=coverage, detection_probability=p, position_covariance=covariance))
+            give(one, intensity(name, 1, STATES[:count] + 10.0 * count, [0.9, 2.1, 0.8][:count]))
+        result = step(one, 1).tracks
+        order = np.lexsort((result.means[:, 1].round(3), result.means[:, 0].round(3)))
+        pictures.append((result.means[order], result.covariances[order], result.existence[order]))
+    assert len(pictures[0][0]) >= 3
+    for other in pictures[1:]:
+        for a, b in zip(pictures[0], other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_a_place_carries_a_bounded_number_of_tracks() -> None:
+    for extract in ("threshold", "rank"):
+        one = centre(("r1",), intensity_extract=extract)
+        for second in (1, 2, 3):
+            give(one, intensity("r1", second, STATES, [1000.0, 3.0, 0.9]))
+            result = step(one, second)
+        assert len(result.tracks.ids) == 24
+        assert (result.tracks.status == CONFIRMED).all()
+        assert result.status.tracks["expected"] == 1004
+
+
 def test_an_old_checkpoint_can_be_used_and_a_spoiled_one_not() -> None:
     one = centre(("r1",))
     give(one, intensity("r1", 1, STATES))
