@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
-from fusion_service.centre.checkpoint import pack_state, unpack_state
+from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.intake import Event, Intake, Order
@@ -77,7 +77,10 @@ class Centre(ABC):
             state, self._picture = unpack_state(checkpoint, self._intake)
             self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
             self._era.unpack(state["era"])
-            self._restore(state)
+            try:
+                self._restore(state["own"])
+            except Exception as error:
+                raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
         if generation is not None:
             self._ids.begin(generation)
         self._journal.event(start_event(self.config, epoch, generation, checkpoint))
@@ -145,7 +148,7 @@ class Centre(ABC):
             "time": self._time,
             "next_id": self._ids.next,
             "era": self._era.pack(),
-            **self._kept(),
+            "own": self._kept(),
         }
         return pack_state(self.config_hash, state, self._intake, self._picture)
 

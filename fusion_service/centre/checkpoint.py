@@ -73,13 +73,12 @@ def unpack_state(blob: bytes, intake: Intake) -> tuple[dict[str, Any], Picture]:
         asked = int(whole.get("frame_asked", -1))
         era = [int(part) for part in whole.get("era", NO_ERA)]
         numbers = {name: int(whole[name]) for name in ("step", "time", "next_id")}
-        evidence = {"merges": whole["merges"], "rivals": whole["rivals"], "entries": whole["entries"]}
     except CheckpointError:
         raise
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
-    return {**numbers, **evidence, "era": era}, picture
+    return {**numbers, "era": era, "own": whole["own"]}, picture
 
 
 def _pack_source(source: Source) -> dict[str, Any]:

@@ -82,6 +82,9 @@ class SourceConfig:
     )
     false_track: float = _setting(0.1, number(1e-6, 1), "chance that a report of a track of it is of nothing")
     covariance_floor: float = _setting(0.0, DURATION, "sigma added to its positions, m")
+    registration_sigma: float = _setting(
+        0.0, number(0.0, 1e5), "kind = intensity: m, error common to all it reports; SensorInfo: position_covariance"
+    )
     inflation: float = _setting(1.0, number(0, 1e6, above=True), "factor on its covariances")
     override: bool = _setting(False, flag, "use these values even where its SensorInfo says otherwise")
     ignore: bool = _setting(False, flag, "refuse all it sends (reason: muted)")
@@ -148,6 +151,9 @@ class CentreConfig:
         "threshold", choice("threshold", "rank"), "tracks: components above the threshold, or the round(mass) heaviest"
     )
     intensity_threshold: float = _setting(0.5, number(0, 1), "weight above which a component is a track")
+    intensity_count_error: float = _setting(
+        0.1, number(1e-9, 0.5), "rate of error at which a place gets another number of tracks than it has"
+    )
     intensity_prune: float = _setting(1e-3, number(0, 1), "weight below which a component is dropped")
     intensity_merge: float = _setting(2.0, number(0, 100), "d2 below which components of one mixture are merged")
     intensity_components: int = _setting(500, whole(1, 5000), "components kept at most")

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 
-from scipy.stats import chi2
+from fusion_service.metrics import chi2_quantile
 
 from fusion_service.config import CentreConfig, ConfigError, centre_config
 from fusion_service.errors import ReviewError, Stopped
