@@ -22,7 +22,7 @@ __all__ = ["FrameVoting", "Vote", "agreed", "convertible", "may_be_picture", "na
 
 
 class Vote(NamedTuple):
-    """The frame and space a source spoke in, and when, ns."""
+    """The frame and space a source spoke in, and at which step, ns."""
 
     frame: Frame
     space: tuple[str, ...]

@@ -331,7 +331,7 @@ class Intake:
         """Let the sources that speak vote on the frame of the picture (see `frames`)."""
         for (source, message, _), faults in checked:
             if (faults == 0).any():
-                source.vote = Vote(message.frame, message.space, message.time)
+                source.vote = Vote(message.frame, message.space, time)
         if self.config.frame is not None:
             return
         votes = {

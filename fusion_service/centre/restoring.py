@@ -44,7 +44,7 @@ def fit_config(
     """Change the tables of `sources` to the config, and return the picture, that was in `space` and `frame`, so."""
     for name, source in sources.items():
         if not set(config.space) <= set(source.space):
-            source.tracks = empty_tracks(len(source.space))
+            source.space, source.tracks = config.space, empty_tracks(len(config.space))
         source.tracks = _moved(source.tracks, source.space, frame, config.frame, config.source(name).height)
         source.muted = source.muted or config.source(name).ignore
     picture = _moved(picture, space, frame, config.frame, config.source_defaults.height)

@@ -17,6 +17,7 @@ def retire(source: Source, said: SourceConfig, time: int, room: int, config: Cen
     `room` are remembered."""
     table, age = source.tracks, time - source.tracks.time
     limit = silence(table.interval, said, config)
+    source.why = "" if source.why == notes.waiting() else source.why
     late = age > limit
     retired = late.any()
     if retired:
