@@ -78,7 +78,8 @@ class Centre(ABC):
             self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
             self._era.unpack(state["era"])
             try:
-                self._restore(state["own"])
+                if state["own"] is not None:
+                    self._restore(state["own"])
             except Exception as error:
                 raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
         if generation is not None:

@@ -27,6 +27,9 @@ if TYPE_CHECKING:
 __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
 
 CHECKPOINT_VERSION = 2
+READABLE = (1, 2)
+NEVER = ("since", "used", "judged", "weighed", "seen", "last_hit", "due")
+"""Columns of times that may not be in a checkpoint of an earlier release."""
 _PLAIN = (
     *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
     *("origin", "waited", "highest", "first", "interval", "ordered", "why", "unused"),
@@ -62,7 +65,7 @@ def unpack_state(blob: bytes, intake: Intake) -> tuple[dict[str, Any], Picture]:
     try:
         whole = msgpack.unpackb(blob)
         version = whole["v"]
-        if version != CHECKPOINT_VERSION:
+        if version not in READABLE:
             raise CheckpointError(f"the checkpoint is of version {version}, this is {CHECKPOINT_VERSION}")
         if whole.get("kind", "tracks") != intake.config.kind:
             raise CheckpointError(f"the checkpoint is of a centre that fuses {whole['kind']}, not {intake.config.kind}")
@@ -78,7 +81,7 @@ def unpack_state(blob: bytes, intake: Intake) -> tuple[dict[str, Any], Picture]:
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
-    return {**numbers, "era": era, "own": whole["own"]}, picture
+    return {**numbers, "era": era, "own": whole.get("own")}, picture
 
 
 def _pack_source(source: Source) -> dict[str, Any]:
@@ -139,7 +142,8 @@ def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
     arrays = []
     for one in fields(like):
         empty = getattr(like, one.name)
-        flat = np.zeros(count, empty.dtype) if one.name not in packed else _array(packed[one.name], empty)
+        blank = np.full(count, -1 if one.name in NEVER else 0, empty.dtype)
+        flat = blank if one.name not in packed else _array(packed[one.name], empty)
         arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)
 

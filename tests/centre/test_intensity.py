@@ -529,13 +529,13 @@ def test_an_old_checkpoint_can_be_used_and_a_spoiled_one_not() -> None:
     give(one, intensity("r1", 1, STATES))
     step(one, 1)
     packed = msgpack.unpackb(one.checkpoint(), strict_map_key=False)
-    del packed["following"]
+    del packed["own"]
     old: Any = IntensityCentre(one.config, msgpack.packb(packed))
     give(old, intensity("r1", 2, STATES))
     assert len(step(old, 2).tracks.ids) == 3
     for spoiled in (7, {}, {"memory": {}, "heard": {}, "total": 0, "total_lean": 0.0}):
         with pytest.raises(CheckpointError, match="cannot be read"):
-            IntensityCentre(one.config, msgpack.packb({**packed, "following": spoiled}))
+            IntensityCentre(one.config, msgpack.packb({**packed, "own": spoiled}))
 
 
 def test_a_mission_is_made_again_from_its_logs(monkeypatch: pytest.MonkeyPatch) -> None:

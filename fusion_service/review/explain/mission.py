@@ -9,10 +9,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 
-from fusion_service.metrics import chi2_quantile
-
 from fusion_service.config import CentreConfig, ConfigError, centre_config
 from fusion_service.errors import ReviewError, Stopped
+from fusion_service.metrics import chi2_quantile
 from fusion_service.progress import Progress
 from fusion_service.recording import RawMessage, read
 from fusion_service.recording.drawing.labels import Labels
@@ -70,8 +69,8 @@ class RecordedMission:
         """Bounds on d2 of a new and of a standing link; NaN where the settings are not known."""
         if self.config is None or self.config.kind == "intensity":
             return math.nan, math.nan
-        new, standing = chi2.ppf([self.config.gate, self.config.keep_gate], len(self.config.space))
-        return float(new), float(standing)
+        n = len(self.config.space)
+        return chi2_quantile(self.config.gate, n), chi2_quantile(self.config.keep_gate, n)
 
 
 def read_mission(
