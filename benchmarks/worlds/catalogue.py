@@ -24,12 +24,12 @@ class Kind(NamedTuple):
 
 KINDS = {
     "formation": Kind(dense.formation, ("gap 20", "gap 10", "gap 5", "gap 10 rough"), ("gap 10",)),
-    "crossing": Kind(dense.crossing, ("10 deg", "30 deg"), ("30 deg",)),
+    "crossing": Kind(dense.crossing, ("3 deg", "10 deg", "30 deg"), ("30 deg",)),
     "lanes": Kind(dense.lanes, ("15 m", "8 m"), ("15 m",)),
     "splits": Kind(dense.splits, ("20 s",), ("20 s",)),
     "joins": Kind(dense.joins, ("resolved", "unresolved"), ("unresolved",)),
     "manoeuvres": Kind(moving.manoeuvres, tuple(moving.KINDS), ("aircraft 5 g",)),
-    "id re-use": Kind(faulty.ids_again, ("one source", "swap"), ("one source", "swap")),
+    "id re-use": Kind(faulty.ids_again, ("one source", "a swaps", "b swaps"), ("one source", "a swaps")),
     "outliers": Kind(faulty.outliers, ("slow source, 300 m", "10 km"), ("10 km",)),
     "clutter": Kind(sparse.clutter, ("0", "20", "100", "200"), ("20",)),
     "detection": Kind(sparse.detection, ("Pd .5", "Pd .7", "Pd .9", "Pd 1"), ("Pd .7",)),

@@ -1,8 +1,8 @@
 """`python -m benchmarks.worlds [--world NAME ...] [--runs N] [--seed S] [--json FILE] [--quick]`: hard worlds.
 
 Every world is made from its seed, given to `FusionCentre` by `handle` and `step`, and measured; "floor" is what an
-assignment that knows the truth makes of the same messages by the same rule. With the folder of recorded data (--data, or
-FUSION_DATA) the tracks of a real traffic radar as well.
+assignment that knows the truth makes of the same messages by the same rule. With the folder of recorded data (--data,
+or FUSION_DATA) the tracks of a real traffic radar as well.
 """
 
 from __future__ import annotations
@@ -24,14 +24,17 @@ __all__ = ["main"]
 HEADING = """# Hard worlds
 
 `python -m benchmarks.worlds --page docs/worlds.md` writes this page. Each row is a small world made from its seed
-(`benchmarks/worlds/` says how each is made), given to the centre as messages, one step a second. Beside it the floor: what
-an assignment that knows the truth makes of the same messages by the same rule.
+(`benchmarks/worlds/` says how each is made), given to the centre as messages, one step a second. Beside it the floor:
+what an assignment that knows the truth makes of the same messages by the same rule.
 
-- ids/target: distinct confirmed ids that were nearest to a target and within c of it, mean and worst over the targets.
-- switches: how often the confirmed track assigned to a target was another than its last one, in the whole run.
+- ids/target: distinct confirmed ids that a target had, mean and worst over the targets. A target keeps its track while
+that
+  is within c; the rest is assigned as GOSPA does.
+- switches: how often a target's confirmed track was another than its last one, in the whole run.
 - gospa: mean over the steps, p = 2, alpha = 2, cut off at c; its parts in m2.
 - duplicates, ghosts: confirmed tracks near a target beyond one for each, and near none; mean over the steps.
-- wrong pairs: global tracks whose contributors are tracks of different targets. In the rows "floor" of formations: those
+- wrong pairs: global tracks whose contributors are tracks of different targets. In the rows "floor" of formations:
+those
   of an optimal assignment made anew at that step.
 - leap: the largest error of a confirmed track from the target it followed, in stated sigmas.
 """

@@ -20,7 +20,7 @@ PAIR = 2000.0
 def formation(variant: str, rng: np.random.Generator, quick: bool) -> World:
     """Targets in line abreast at 15 m/s, gap as said; "rough": sensors so rough that the local sigma stays at 4.7 m."""
     gap = float(variant.split()[1])
-    sigma, q = (10.0, 0.5) if "rough" in variant else (4.7, 0.1)
+    sigma, q = (10.0, 0.5) if "rough" in variant else (4.7, 0.3)
     count, seconds = (30, 15.0) if quick else (120, 60.0)
     places = np.stack([gap * np.arange(count), np.zeros(count)], axis=1)
     path = straight(places, np.tile([0.0, 15.0], (count, 1)))

@@ -22,14 +22,19 @@ def cruising(rng: np.random.Generator, count: int, gap: float = 2000.0, speed: f
 
 
 def ids_again(variant: str, rng: np.random.Generator, quick: bool) -> World:
-    """"one source": the only source gives the ids of five of its ten targets to things 50 km away, and loses those
-    targets. "swap": the second of two sources swaps the ids of five pairs of targets 500 m apart."""
+    """ "one source": the only source gives the ids of five of its ten targets to things 50 km away, and loses those
+    targets. "a swaps", "b swaps": one of two sources, a and b, swaps the ids of five pairs of targets 500 m apart."""
     at, seconds = (8.0, 20.0) if quick else (40.0, 90.0)
     a, b = Sensor("a", 10.0, 0.5), Sensor("b", 10.0, 0.5, phase=0.3)
-    if variant == "swap":
+    if variant != "one source":
         path = cruising(rng, 10, gap=500.0, speed=3.0)
-        feeds = [(a, observe(a, path, seconds, rng)), (b, [_swapped(s, at) for s in observe(b, path, seconds, rng)])]
+        begin = {"a": seconds, "b": seconds, variant[0]: at}
+        feeds = [(one, [_swapped(s, begin[one.name]) for s in observe(one, path, seconds, rng)]) for one in (a, b)]
         return world("id re-use", variant, path, seconds, feeds, 60.0)
+    return _far_away(a, at, seconds, rng)
+
+
+def _far_away(a: Sensor, at: float, seconds: float, rng: np.random.Generator) -> World:
     near, shift = cruising(rng, 10), np.array([50_000.0, 0.0, 0.0, 0.0])
 
     def path(times: Floats) -> Floats:
@@ -41,12 +46,12 @@ def ids_again(variant: str, rng: np.random.Generator, quick: bool) -> World:
         return np.isfinite(states[..., 0]) & ~lost
 
     scans = _again(observe(replace(a, drop=1), path, seconds, rng, seen=seen))
-    return world("id re-use", variant, path, seconds, [(a, scans)], 60.0)
+    return world("id re-use", "one source", path, seconds, [(a, scans)], 60.0)
 
 
 def _swapped(scan: Scan, at: float) -> Scan:
-    """From `at` on the targets 0 and 1, 2 and 3, ... go under each other's ids."""
-    if scan.time < at:
+    """After `at` the targets 0 and 1, 2 and 3, ... go under each other's ids."""
+    if scan.time <= at:
         return scan
     other = {int(target): int(one) for target, one in zip(scan.target, scan.id, strict=True)}
     ids = np.array([other[int(target) ^ 1] for target in scan.target], dtype=np.uint64)
@@ -70,7 +75,8 @@ def _sorted(scan: Scan) -> Scan:
 
 
 def outliers(variant: str, rng: np.random.Generator, quick: bool) -> World:
-    """One scan far off, once established: all tracks of source a by 300 m (a reports every 10 s), or by 10 km (1 Hz)."""
+    """One scan far off, once established: all tracks of source a by 300 m (a reports every 10 s), or by 10 km (1
+    Hz)."""
     slow = "slow" in variant
     count, seconds = (4, 30.0) if quick else (20, 120.0)
     a = Sensor("a", 10.0, 0.5, period=10.0 if slow and not quick else 1.0)

@@ -21,8 +21,8 @@ SECOND = 10**9
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Flight:
-    """For each step: the confirmed tracks of the centre, those of the floor (None where nobody knows what the tracks are
-    tracks of), global tracks of mixed contributors, wrong pairs of a fresh assignment; and ms of a step (S,)."""
+    """For each step: the confirmed tracks of the centre, those of the floor (None where nobody knows what the tracks
+    are tracks of), global tracks of mixed contributors, wrong pairs of a fresh assignment; and ms of a step (S,)."""
 
     pictures: list[Picture]
     floor: list[Picture] | None
@@ -33,7 +33,7 @@ class Flight:
 
 def confirmed(tracks: GlobalTracks) -> Picture:
     """The confirmed tracks of a picture of Gaussians, in the horizontal plane."""
-    axes = [tracks.space.index("x"), tracks.space.index("y")]
+    axes = np.array([tracks.space.index("x"), tracks.space.index("y")])
     rows = np.flatnonzero(tracks.status == CONFIRMED)
     return Picture(tracks.ids[rows], tracks.means[np.ix_(rows, axes)], tracks.covariances[np.ix_(rows, axes, axes)])
 

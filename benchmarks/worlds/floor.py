@@ -57,7 +57,11 @@ class Ear:
         self.newest = message.time
         rows = np.flatnonzero(target >= 0)[::-1]
         who = target[rows]
-        self.mean[who], self.covariance[who], self.time[who] = message.means[rows], message.covariances[rows], message.time
+        self.mean[who], self.covariance[who], self.time[who] = (
+            message.means[rows],
+            message.covariances[rows],
+            message.time,
+        )
         self.listed = np.isin(np.arange(len(self.time)), who)
 
     def at(self, time: int) -> tuple[Floats, Floats]:
@@ -77,7 +81,7 @@ def known_assignment(ears: list[Ear], time: int, rule: str) -> Picture:
     code = (use * 2 ** np.arange(len(ears))[:, None]).sum(axis=0)
     place, spread = np.zeros((use.shape[1], 2)), np.zeros((use.shape[1], 2, 2))
     for which in np.unique(code[code > 0]).tolist():
-        who, of = np.flatnonzero(code == which), [s for s in range(len(ears)) if which >> s & 1]
+        who, of = np.flatnonzero(code == which), np.flatnonzero(which >> np.arange(len(ears)) & 1)
         x, P = means[np.ix_(of, who)].swapaxes(0, 1), covariances[np.ix_(of, who)].swapaxes(0, 1)
         if len(of) == 1:
             fused_mean, fused_covariance = x[:, 0], P[:, 0]

@@ -19,7 +19,8 @@ KINDS = {
     "boat 30 deg/s": (10.0, np.radians(30.0), 5.0, 27.0),
     "boat 30 deg/s, small q": (10.0, np.radians(30.0), 5.0, 1.0),
 }
-"""Speed, m/s, turn rate, rad/s, sigma of a measured position, m, and q, m2/s3: about a2 times the period, or far less."""
+"""Speed, m/s, turn rate, rad/s, sigma of a measured position, m, and q, m2/s3: about a2 times the period, or far
+less."""
 
 
 def manoeuvres(variant: str, rng: np.random.Generator, quick: bool) -> World:
@@ -50,6 +51,7 @@ def _turning(places: Floats, rng: np.random.Generator, speed: float, rate: float
 
     def path(times: Floats) -> Floats:
         index = np.clip(np.round(times / 0.01).astype(int), 0, len(fine) - 1)
-        return states[index]
+        at: Floats = states[index]
+        return at
 
     return path

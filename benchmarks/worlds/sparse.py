@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -56,14 +58,14 @@ def overlap(variant: str, rng: np.random.Generator, quick: bool) -> World:
     a = Sensor("a", 10.0, 0.5, range=reach, place=(half - reach, 0.0), drop=2)
     b = Sensor("b", 10.0, 0.5, phase=0.5, range=reach, place=(reach - half, 0.0), drop=2)
 
-    def within(sensor: Sensor) -> NDArray[np.bool_] | object:
-        def seen(times: Floats, states: Floats) -> NDArray[np.bool_]:
-            return np.linalg.norm(states[..., :2] - np.array(sensor.place), axis=2) <= reach
-
-        return seen
-
-    feeds = [(sensor, observe(sensor, path, seconds, rng, seen=within(sensor))) for sensor in (a, b)]
+    feeds = [(sensor, observe(sensor, path, seconds, rng, seen=partial(_within, sensor))) for sensor in (a, b)]
     return world("overlap", variant, path, seconds, feeds, 60.0)
+
+
+def _within(sensor: Sensor, times: Floats, states: Floats) -> NDArray[np.bool_]:
+    """Which of the states (K, T, 4) are in the declared coverage."""
+    there: NDArray[np.bool_] = np.linalg.norm(states[..., :2] - np.array(sensor.place), axis=2) <= (sensor.range or 0.0)
+    return there
 
 
 def rates(variant: str, rng: np.random.Generator, quick: bool) -> World:

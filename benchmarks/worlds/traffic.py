@@ -1,16 +1,18 @@
 """`radar-v2x`: the tracks of a real traffic radar, whose numbers are used again and again, through the centre.
 
-There is no truth, but there are lives: a number's life ends where the number is away for more than `AWAY` s, and where what
-comes back, after however short a time, is physically not the same object: from where it was, at its velocity, it is off by
-more than `NEAR` m + `DRIFT` m for each second away, or its speed differs by more than `SPEED` m/s + `SPEEDING` for each
-second (no more than 5 s counted). A confirmed global id joins two lives wrongly if it has both, one after the other, and
-they are not the same object by that measure. A life is broken if it has several confirmed global ids.
+There is no truth, but there are lives: a number's life ends where the number is away for more than `AWAY` s, and where
+what comes back, after however short a time, is physically not the same object: from where it was, at its velocity, it
+is off by more than `NEAR` m + `DRIFT` m for each second away, or its speed differs by more than `SPEED` m/s +
+`SPEEDING` for each second (no more than 5 s counted). A confirmed global id joins two lives wrongly if it has both,
+one after the other, and they are not the same object by that measure. A life is broken if it has several confirmed
+global ids.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -89,10 +91,10 @@ def lives_of(reports: Sequence[Report]) -> list[Life]:
 
 
 def joins(seen: Sequence[tuple[float, dict[int, int]]], lives: Sequence[Life]) -> dict[str, Any]:
-    """What the pictures did with lives. seen: for each step its time, s, and the number that each confirmed global id had
-    from the radar. "wrong": successive lives of one global id that are not the same object, and of those "wrong_number"
-    under one number; "broken": lives with several global ids; "extra": ids beyond the first; "without": lives of 3 s or
-    more with none."""
+    """What the pictures did with lives. seen: for each step its time, s, and the number that each confirmed global id
+    had from the radar. "wrong": successive lives of one global id that are not the same object, and of those
+    "wrong_number" under one number; "broken": lives with several global ids; "extra": ids beyond the first; "without":
+    lives of 3 s or more with none."""
     ids: dict[int, list[int]] = defaultdict(list)
     owners: dict[int, list[int]] = defaultdict(list)
     by_number: dict[int, list[int]] = defaultdict(list)
@@ -109,7 +111,7 @@ def joins(seen: Sequence[tuple[float, dict[int, int]]], lives: Sequence[Life]) -
     wrong = [
         lives[a].number == lives[b].number
         for chain in ids.values()
-        for a, b in zip(chain, chain[1:], strict=False)
+        for a, b in pairwise(chain)
         if not same_object(*sorted((lives[a], lives[b]), key=lambda life: float(life.times[0])))
     ]
     return {
@@ -124,8 +126,7 @@ def joins(seen: Sequence[tuple[float, dict[int, int]]], lives: Sequence[Life]) -
 
 
 def measure(folder: Path, seconds: float | None = None) -> dict[str, Any]:
-    """`joins` of the recording (its first `seconds`) for each period of the centre, and to how many lives of the radar the
-    vehicle's own reports were joined."""
+    """`joins` of the recording (its first `seconds`) for each period of the centre, which hears the vehicle as well."""
     radar = radar_v2x.read_radar(folder / "radar.csv")
     vehicle = radar_v2x.read_vehicle(folder / "vehicle1.csv")
     end = radar[-1].time if seconds is None else radar[0].time + round(seconds * SECOND)
@@ -173,9 +174,8 @@ def report(found: dict[str, Any], before: dict[str, Any] | None = None) -> list[
         "|---|---|---|---|---|---|---|---|",
     ]
     names = ("lives", "ids", "wrong", "wrong_number", "broken", "extra", "without")
-    for label, rows in (("", found),):
-        for period, one in rows.items():
-            if before and period in before:
-                lines.append(f"| {period}, before | " + " | ".join(f"{before[period][name]}" for name in names) + " |")
-            lines.append(f"| {period}{label} | " + " | ".join(f"{one[name]}" for name in names) + " |")
+    for period, one in found.items():
+        if before and period in before:
+            lines.append(f"| {period}, before | " + " | ".join(f"{before[period][name]}" for name in names) + " |")
+        lines.append(f"| {period} | " + " | ".join(f"{one[name]}" for name in names) + " |")
     return lines

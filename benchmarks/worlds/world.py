@@ -131,7 +131,8 @@ def grid(count: int, gap: float) -> Floats:
     """`count` places (T, 2) on a square grid about 0."""
     side = int(np.ceil(np.sqrt(count)))
     rows, columns = np.divmod(np.arange(count), side)
-    return gap * (np.stack([columns, rows], axis=1) - (side - 1) / 2)
+    places = gap * (np.stack([columns, rows], axis=1).astype(np.float64) - (side - 1) / 2)
+    return places
 
 
 def scan_times(sensor: Sensor, seconds: float) -> Floats:
@@ -235,7 +236,7 @@ def world(
 ) -> World:
     """The world of these sources: steps every `period` s up to `seconds`, fused in `FRAME`; the rest of the config is
     the centre's own."""
-    steps = period * np.arange(1, int(seconds / period + 1e-9) + 1)
+    steps = period * np.arange(1, int(seconds / period + 1e-9) + 1, dtype=np.float64)
     everything = [one for sensor, scans in feeds for one in told(sensor, scans)]
     everything.sort(key=lambda one: (one.received, one.message.source, one.message.type, one.message.seq))
     times = np.array([ns(step) for step in steps.tolist()], dtype=np.int64)

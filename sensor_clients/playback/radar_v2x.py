@@ -1,10 +1,10 @@
 """A traffic radar and the reports of one vehicle at a crossing in Gainesville, 2017-05-02 (Emami, `sensible`, MIT).
 
-`radar.csv`: the track output of a Smartmicro UMRR, 20 scans a second: time (s of the day, UTC), the object's number, x and
-y (ahead and left of the radar, m), vx, vy (m/s). A number is used again and again, a second later for another vehicle.
-`vehicle1.csv`: DSRC reports as received beside the road: each fix about four times with the same stamp, .15 to .2 s late.
-No covariances are said by the radar: `RADAR_SIGMA` is chosen. Everything here is in the ENU frame of the radar's place; the
-radar looks 3.6 degrees to the left of north. There is no truth.
+`radar.csv`: the track output of a Smartmicro UMRR, 20 scans a second: time (s of the day, UTC), the object's number, x
+and y (ahead and left of the radar, m), vx, vy (m/s). A number is used again and again, a second later for another
+vehicle. `vehicle1.csv`: DSRC reports as received beside the road: each fix about four times with the same stamp, .15
+to .2 s late. No covariances are said by the radar: `RADAR_SIGMA` is chosen. Everything here is in the ENU frame of the
+radar's place; the radar looks 3.6 degrees to the left of north. There is no truth.
 """
 
 from __future__ import annotations
@@ -38,7 +38,9 @@ VEHICLE_SIGMA, VEHICLE_SPEED = 1.0, 0.3
 SPACE = ("x", "y", "vx", "vy")
 SUMMARY = "a traffic radar with numbers used again, and one vehicle's reports, about 5 minutes"
 PARAMETERS = (
-    Parameter("radar's place", "29.6216931 N 82.3867591 W, looking 3.6 degrees left of north", "authors' configuration"),
+    Parameter(
+        "radar's place", "29.6216931 N 82.3867591 W, looking 3.6 degrees left of north", "authors' configuration"
+    ),
     Parameter("radar: sigma of x, y, vx, vy", "1 m, 1 m, 0.5 m/s, 2 m/s", "chosen"),
     Parameter("vehicle: sigma of place, velocity", "as said, 1 m at least; 0.3 m/s", "chosen"),
     Parameter("motion", "cv, 2 m2/s3", "chosen"),
@@ -80,8 +82,8 @@ def read_vehicle(path: Path) -> list[Report]:
         course = np.radians(heading)
         mean = np.array([[float(east), float(north), speed * np.sin(course), speed * np.cos(course)]])
         sigma = [max(rms_lon, VEHICLE_SIGMA), max(rms_lat, VEHICLE_SIGMA), VEHICLE_SPEED, VEHICLE_SPEED]
-        times = (MIDNIGHT + round(one * SECOND) for one in (stamp, received))
-        out.append(Report(*times, np.ones(1, dtype=np.uint64), mean, np.diag(np.square(sigma))[None]))
+        time, heard = (MIDNIGHT + round(one * SECOND) for one in (stamp, received))
+        out.append(Report(time, heard, np.ones(1, dtype=np.uint64), mean, np.diag(np.square(sigma))[None]))
     return out
 
 
@@ -116,12 +118,14 @@ def _events(name: str, reports: list[Report]) -> Iterator[Event]:
 
 
 def load(directory: Path) -> Scenario:
-    """The two files as a scenario, each message due at the time of its states (the vehicle's were later). FileNotFoundError,
-    ValueError."""
+    """The two files as a scenario, each message due at the time of its states (the vehicle's were later).
+    FileNotFoundError, ValueError."""
     reports = {"radar": read_radar(directory / "radar.csv"), "vehicle1": read_vehicle(directory / "vehicle1.csv")}
     start, end = min(one[0].time for one in reports.values()), max(one[-1].time for one in reports.values())
     sensors = {name: partial(_said, name, found) for name, found in reports.items()}
-    return Scenario("radar-v2x", SUMMARY, start, (end - start) / SECOND, "replay", PARAMETERS, sensors, lambda: iter(()))
+    return Scenario(
+        "radar-v2x", SUMMARY, start, (end - start) / SECOND, "replay", PARAMETERS, sensors, lambda: iter(())
+    )
 
 
 def _said(name: str, reports: list[Report], seed: int) -> Iterator[Event]:
