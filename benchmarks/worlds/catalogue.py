@@ -33,7 +33,7 @@ KINDS = {
     "outliers": Kind(faulty.outliers, ("slow source, 300 m", "10 km"), ("10 km",)),
     "clutter": Kind(sparse.clutter, ("0", "20", "100", "200"), ("20",)),
     "detection": Kind(sparse.detection, ("Pd .5", "Pd .7", "Pd .9", "Pd 1"), ("Pd .7",)),
-    "rates": Kind(sparse.rates, ("10, 1, .1 Hz", "10, .1 Hz", ".1, .1 Hz", ".1 Hz"), ("10, 1, .1 Hz",)),
+    "rates": Kind(sparse.rates, ("10, 1, .1 Hz", "10, .1 Hz", ".1, .1 Hz", ".1 Hz", ".1 Hz unsaid"), ("10, 1, .1 Hz",)),
     "latencies": Kind(
         faulty.latencies,
         ("10 Hz, .9 s late", "10 Hz, .9 s late; 1 Hz", "1 Hz, 4 s late; 1 Hz"),

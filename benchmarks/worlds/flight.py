@@ -57,6 +57,7 @@ def fly(world: World) -> Flight:
             if isinstance(message, SensorInfo):
                 ears.setdefault(message.source, Ear.of(message.motion, targets))
             elif target is not None:
+                ears.setdefault(message.source, Ear.of(centre.config.source(message.source).motion, targets))
                 waiting.append((message, target))
             at += 1
         begin = perf_counter()

@@ -69,11 +69,12 @@ def _within(sensor: Sensor, times: Floats, states: Floats) -> NDArray[np.bool_]:
 
 
 def rates(variant: str, rng: np.random.Generator, quick: bool) -> World:
-    """15 targets seen at the rates said, Hz, each source with its own."""
+    """15 targets seen at the rates said, Hz, each source with its own; "unsaid": without a SensorInfo."""
     count, seconds = (3, 40.0) if quick else (15, 180.0)
     path = cruising(rng, count)
     feeds = []
-    for k, word in enumerate(variant.removesuffix(" Hz").split(", ")):
-        sensor = Sensor("abc"[k], 10.0, 0.1, period=1 / float(word), phase=min(0.2 * k + 0.1, 1 / float(word)))
+    for k, word in enumerate(variant.removesuffix(" unsaid").removesuffix(" Hz").split(", ")):
+        period, informs = 1 / float(word), not variant.endswith("unsaid")
+        sensor = Sensor("abc"[k], 10.0, 0.1, period, min(0.2 * k + 0.1, period), informs=informs)
         feeds.append((sensor, observe(sensor, path, seconds, rng)))
     return world("rates", variant, path, seconds, feeds, 60.0)

@@ -121,7 +121,7 @@ def joins(seen: Sequence[tuple[float, dict[int, int]]], lives: Sequence[Life]) -
         "wrong_number": sum(wrong),
         "broken": sum(len(of) > 1 for of in owners.values()),
         "extra": sum(len(of) - 1 for of in owners.values()),
-        "without": sum(life.times[-1] - life.times[0] >= 3.0 and not owners[k] for k, life in enumerate(lives)),
+        "without": sum(bool(life.times[-1] - life.times[0] >= 3.0) and k not in owners for k, life in enumerate(lives)),
     }
 
 

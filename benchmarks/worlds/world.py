@@ -61,7 +61,8 @@ def ns(seconds: float) -> int:
 class Sensor:
     """A sensor and its tracker. sigma: of a measured position on each axis, m; q as declared, m2/s3; period, phase (of
     the first scan) and latency, s; speed: sigma of a new track's velocity, m/s; bias of all it sees, m; detection:
-    probability; drop: misses in a row that end a track; range: declared coverage, m (None: nothing declared)."""
+    probability; drop: misses in a row that end a track; range: declared coverage, m, about `place` (None: nothing is
+    declared); informs: it sends a SensorInfo."""
 
     name: str
     sigma: float
@@ -75,6 +76,7 @@ class Sensor:
     drop: int = 3
     range: float | None = None
     place: tuple[float, float] = (0.0, 0.0)
+    informs: bool = True
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -131,14 +133,14 @@ def grid(count: int, gap: float) -> Floats:
     """`count` places (T, 2) on a square grid about 0."""
     side = int(np.ceil(np.sqrt(count)))
     rows, columns = np.divmod(np.arange(count), side)
-    places = gap * (np.stack([columns, rows], axis=1).astype(np.float64) - (side - 1) / 2)
-    return places
+    centred = np.stack([columns, rows], axis=1).astype(np.float64) - (side - 1) / 2
+    return gap * centred
 
 
 def scan_times(sensor: Sensor, seconds: float) -> Floats:
     """Its scans up to `seconds`, s: the first after `phase`, or after a period."""
     first = sensor.phase or sensor.period
-    return first + sensor.period * np.arange(int((seconds - first) / sensor.period + 1e-9) + 1)
+    return first + sensor.period * np.arange(int((seconds - first) / sensor.period + 1e-9) + 1, dtype=np.float64)
 
 
 def flickers(rng: np.random.Generator, scans: int, number: float, area: float, life: float, drop: int) -> Floats:
@@ -203,7 +205,7 @@ def told(sensor: Sensor, scans: Iterable[Scan]) -> list[Told]:
         coverage=coverage,
         detection_probability=None if coverage is None else sensor.detection,
     )
-    out = [Told(START, info)]
+    out = [Told(START, info)] if sensor.informs else []
     for seq, scan in enumerate(scans):
         message = LocalTracks(
             **header,
