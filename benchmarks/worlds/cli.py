@@ -27,7 +27,7 @@ HEADING = """# Hard worlds
 (`benchmarks/worlds/` says how each is made), given to the centre as messages, one step a second. Beside it the floor:
 what an assignment that knows the truth makes of the same messages by the same rule.
 
-- ids/target: distinct confirmed ids that a target had, mean and worst over the targets. A target keeps its track while
+- ids/target: distinct confirmed ids that followed a target, duplicates too, mean and worst. A target keeps its track while
 that
   is within c; the rest is assigned as GOSPA does.
 - switches: how often a target's confirmed track was another than its last one, in the whole run.

@@ -33,8 +33,8 @@ class Picture(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Scores:
-    """ids: distinct ids that a target had over the run, mean and worst over targets; nearest: distinct ids that were
-    the nearest to it, and near. switches: how often a target's id was another than its last. gospa and its parts:
+    """ids: distinct ids that followed a target over the run, mean and worst over targets; nearest: distinct ids that
+    were the nearest to it, and near. switches: how often a target's id was another than its last. gospa and its parts:
     means over steps, m and m2. duplicates: mean number of confirmed tracks near a target that are not assigned to one.
     ghosts: mean number near no target. leap: the largest sqrt(e' P^-1 e) of a confirmed track from the target that it
     followed. confirmed: distinct ids in all."""
@@ -78,11 +78,12 @@ def score(truth: Sequence[Floats] | Floats, pictures: Iterable[Picture], cutoff:
         gap = np.where(near, gap, np.inf)
         for target in np.flatnonzero(near.any(axis=1)).tolist():
             nearest[target].add(ids[int(gap[target].argmin())])
+        follows.update({one: target for target, one in last.items()})
         for track in np.flatnonzero(near.any(axis=0)).tolist():
             follows.setdefault(ids[track], int(gap[:, track].argmin()))
-        for target, one in last.items():
-            had[target].add(one)
-            follows[one] = target
+        for one in ids:
+            if one in follows:
+                had[follows[one]].add(one)
     means = np.mean(parts, axis=0).tolist()
     counts, closest = ([len(one) for one in sets] for sets in (had, nearest))
     gospa_mean, localisation, missed, false, duplicates, ghosts = means

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -80,13 +81,13 @@ def test_wrong_joins_and_broken_lives() -> None:
     assert joins([], lives)["without"] == 5
 
 
-def test_the_folder_is_found_or_not(tmp_path: os.PathLike[str]) -> None:
-    folder = os.path.join(tmp_path, "radar-v2x")
+def test_the_folder_is_found_or_not(tmp_path: Path) -> None:
+    folder = tmp_path / "radar-v2x"
     assert traffic.find(None) is None
     assert traffic.find(tmp_path) is None
-    os.mkdir(folder)
-    open(os.path.join(folder, "radar.csv"), "w").close()
-    assert str(traffic.find(tmp_path)) == str(traffic.find(folder)) == folder
+    folder.mkdir()
+    (folder / "radar.csv").touch()
+    assert traffic.find(tmp_path) == traffic.find(folder) == folder
 
 
 @pytest.mark.skipif(DATA is None, reason="FUSION_DATA names no folder with radar-v2x")

@@ -65,7 +65,7 @@ def test_ids_switches_duplicates_and_ghosts() -> None:
         (there, picture({})),
     ]
     found = scores(steps)
-    assert (found["ids_worst"], found["ids_mean"]) == (2, 1.0), "ids 1 and 2; the second target was never there"
+    assert (found["ids_worst"], found["ids_mean"]) == (3, 1.5), "duplicates count; the second target was never there"
     assert (found["nearest_worst"], found["nearest_mean"]) == (3, 1.5)
     assert found["switches"] == 1, "2 stays near, so that 3, nearer in the third step, changes nothing"
     assert (found["duplicates"], found["ghosts"], found["confirmed"]) == (0.5, 0.25, 4)
@@ -138,8 +138,8 @@ def test_the_floor_fuses_what_is_of_one_target() -> None:
     older, newer = np.diag([13.0, 13.0, 1.0, 1.0]), np.diag([9.0, 9.0, 1.0, 1.0])  # 9 + 2^2, with its correlation
     older[[0, 1, 2, 3], [2, 3, 0, 1]] = 2.0
     fused = fuse("ci", np.array([[50.0, 0, 0, 0], [52, 0, 0, 0]]), np.stack([older, newer]))
-    np.testing.assert_allclose(seen.place, [[0, 0], fused.mean[:2]], atol=1e-9)
-    np.testing.assert_allclose(seen.covariance, [13 * np.eye(2), fused.covariance[:2, :2]], atol=1e-9)
+    np.testing.assert_allclose(seen.place, np.stack([np.zeros(2), fused.mean[:2]]), atol=1e-9)
+    np.testing.assert_allclose(seen.covariance, np.stack([13 * np.eye(2), fused.covariance[:2, :2]]), atol=1e-9)
 
 
 def test_the_floor_holds_what_nobody_lists_for_a_while() -> None:
