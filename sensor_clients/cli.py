@@ -17,7 +17,7 @@ from typing import Any
 from fusion_service.bus import DEFAULT_ENDPOINT, BusError, BusStopped
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
-from sensor_clients.playback import autoferry, table
+from sensor_clients.playback import autoferry, radar_v2x, table
 from sensor_clients.publisher import TrackPublisher, TruthPublisher
 from sensor_clients.runner import pace
 from sensor_clients.scenarios.three_radars import TRACKERS, three_radars
@@ -31,6 +31,7 @@ EXAMPLES = """examples:
   sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
   sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
+  sensor-client playback radar-v2x --sensor radar --data /data
   sensor-client playback tracks.csv --sensor radar1        what `fusion-service export` has written
 """
 
@@ -70,7 +71,9 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(run=_simulate)
     playback = _command(commands, "playback", "play recorded returns through a local tracker, or tracks", EXAMPLES)
     numbers = ", ".join(map(str, autoferry.SCENARIOS))
-    playback.add_argument("scenario", help=f"autoferry:N, N one of {numbers}; or a .csv or .parquet file of tracks")
+    playback.add_argument(
+        "scenario", help=f"autoferry:N, N one of {numbers}; radar-v2x; or a .csv or .parquet file of tracks"
+    )
     playback.add_argument("--data", type=Path, help="directory of the scenario files (default: $FUSION_DATA)")
     playback.set_defaults(run=_playback)
     for command in (simulate, playback):
@@ -115,6 +118,10 @@ def _list(_: argparse.Namespace) -> int:
     print(f"playback autoferry:N  N in {', '.join(map(str, autoferry.SCENARIOS))}: {autoferry.SUMMARY}")
     print(f"  sensors: {', '.join(autoferry.SENSORS)}, truth; needs --data or FUSION_DATA")
     print(_table(autoferry.PARAMETERS))
+    print()
+    print(f"playback radar-v2x  {radar_v2x.SUMMARY}")
+    print(f"  sensors: {', '.join(radar_v2x.SENSORS)}; needs --data or FUSION_DATA")
+    print(_table(radar_v2x.PARAMETERS))
     return 0
 
 
@@ -138,11 +145,19 @@ def _playback(arguments: argparse.Namespace) -> int:
     path = Path(arguments.scenario)
     if path.suffix in table.SUFFIXES:
         return _publish(table.load(path), arguments, 0, table.lineage(path, arguments.sensor))
+    data = arguments.data or os.environ.get("FUSION_DATA")
+    if arguments.scenario == "radar-v2x":
+        if not data:
+            raise UsageError(
+                "no data: say --data DIR or set FUSION_DATA to the directory of radar.csv, or one above it"
+            )
+        return _publish(radar_v2x.load(radar_v2x.find(Path(data))), arguments, 0)
     name, _, number = arguments.scenario.partition(":")
     if name != "autoferry" or number not in map(str, autoferry.SCENARIOS):
         known = ", ".join(f"autoferry:{n}" for n in autoferry.SCENARIOS)
-        raise UsageError(f"no recorded scenario {arguments.scenario!r}; known: {known}, or a .csv or .parquet file")
-    data = arguments.data or os.environ.get("FUSION_DATA")
+        raise UsageError(
+            f"no recorded scenario {arguments.scenario!r}; known: {known}, radar-v2x, or a .csv or .parquet file"
+        )
     if not data:
         raise UsageError("no data: say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")
     return _publish(autoferry.load(Path(data), int(number)), arguments, 0)

@@ -32,15 +32,14 @@ what an assignment that knows the truth makes of the same messages by the same r
 - switches: how often a target's confirmed track was another than its last one, in the whole run.
 - gospa: mean over the steps, p = 2, alpha = 2, cut off at c; its parts in m2.
 - duplicates, ghosts: confirmed tracks near a target beyond one for each, and near none; mean over the steps.
-- wrong pairs: global tracks whose contributors are tracks of different targets. In the rows "floor" of formations:
-those
-  of an optimal assignment made anew at that step.
+- wrong pairs: global tracks whose contributors are tracks of different targets. In the rows "floor" of
+  formations: those of an optimal assignment made anew at that step.
 - leap: the largest error of a confirmed track from the target it followed (or one within c of that), in stated sigmas.
 
-Last, the tracks of a real traffic radar (`radar-v2x`, MIT; with `--data DIR`), whose 64 numbers are used again and again.
-A life is what one number was for as long as it was there and physically one object; joined wrongly: successive lives of
-one confirmed global id that cannot be one object (`benchmarks/worlds/traffic.py` has the measure); broken: lives with
-several confirmed global ids.
+Last, the tracks of a real traffic radar (`radar-v2x`, MIT; with `--data DIR`), whose 64 numbers are used again and
+again. A life is what one number was for as long as it was there and physically one object; joined wrongly: successive
+lives of one confirmed global id that cannot be one object (`benchmarks/worlds/traffic.py` has the measure); broken:
+lives with several confirmed global ids.
 """
 
 

@@ -49,10 +49,10 @@ class Life(NamedTuple):
 
 def find(data: Path | str | None) -> Path | None:
     """The folder itself, or the one of that name in it, if it has the radar's tracks."""
-    for folder in () if data is None else (Path(data), Path(data) / NAME):
-        if (folder / "radar.csv").is_file():
-            return folder
-    return None
+    if data is None:
+        return None
+    folder = radar_v2x.find(Path(data))
+    return folder if (folder / "radar.csv").is_file() else None
 
 
 def same_object(first: Life, second: Life) -> bool:

@@ -22,7 +22,19 @@ from fusion_service import geodesy
 from schemas import Disk, Enu, Motion
 from sensor_clients.events import Event, Parameter, Scenario
 
-__all__ = ["FRAME", "Report", "info", "load", "read_radar", "read_vehicle"]
+__all__ = [
+    "FRAME",
+    "PARAMETERS",
+    "SENSORS",
+    "SPACE",
+    "SUMMARY",
+    "Report",
+    "find",
+    "info",
+    "load",
+    "read_radar",
+    "read_vehicle",
+]
 
 Floats = NDArray[np.float64]
 
@@ -36,6 +48,7 @@ RADAR_SIGMA = (1.0, 1.0, 0.5, 2.0)
 VEHICLE_SIGMA, VEHICLE_SPEED = 1.0, 0.3
 """The least sigma of a vehicle's place that is believed, m, and that of its velocity, m/s: chosen."""
 SPACE = ("x", "y", "vx", "vy")
+SENSORS = ("radar", "vehicle1")
 SUMMARY = "a traffic radar with numbers used again, and one vehicle's reports, about 5 minutes"
 PARAMETERS = (
     Parameter(
@@ -45,6 +58,12 @@ PARAMETERS = (
     Parameter("vehicle: sigma of place, velocity", "as said, 1 m at least; 0.3 m/s", "chosen"),
     Parameter("motion", "cv, 2 m2/s3", "chosen"),
 )
+
+
+def find(data: Path) -> Path:
+    """The folder of the recording: `radar-v2x` in `data` where that is there, else `data` itself."""
+    below = data / "radar-v2x"
+    return below if (below / "radar.csv").is_file() else data
 
 
 class Report(NamedTuple):

@@ -59,6 +59,15 @@ def test_as_a_scenario(folder: Path) -> None:
     assert not list(scenario.truth())
 
 
+def test_the_folder_is_given_or_one_above_it(folder: Path) -> None:
+    assert radar_v2x.find(folder) == folder
+    below = folder / "radar-v2x"
+    below.mkdir()
+    assert radar_v2x.find(folder) == folder, "nothing is in it"
+    (below / "radar.csv").write_text(RADAR)
+    assert radar_v2x.find(folder) == below
+
+
 def test_what_cannot_be_read_is_said_with_its_line(folder: Path) -> None:
     (folder / "radar.csv").write_text(RADAR + "10.1,2,here,0,0,0,0\n")
     with pytest.raises(ValueError, match=r"radar\.csv:5: cannot be read"):
