@@ -52,7 +52,7 @@ def told(name: str, second: float, means: Array, P: Array, ids: Any = None, **mo
 
 def shown(result: StepResult) -> Array:
     """Places (K, 2) of what an operator sees."""
-    return result.tracks.means[result.tracks.status != TENTATIVE][:, :2]
+    return np.asarray(result.tracks.means[result.tracks.status != TENTATIVE][:, :2])
 
 
 def near(result: StepResult, place: Any) -> int:
