@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
@@ -14,6 +13,7 @@ from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 
 __all__ = [
     "Gospa",
@@ -27,8 +27,6 @@ __all__ = [
     "ospa",
 ]
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Tree: TypeAlias = cKDTree
 
 DENSE = 2500
@@ -47,7 +45,7 @@ class Gospa(NamedTuple):
     localisation: float
     missed: float
     false: float
-    assignment: NDArray[np.intp]
+    assignment: Ints
 
 
 def gospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0, alpha: float = 2.0) -> Gospa:
@@ -68,7 +66,7 @@ def gospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0, alpha: flo
     return Gospa((localisation + missed + false) ** (1 / p), localisation, missed, false, assignment)
 
 
-def near_pairs(truth: Floats | Tree, estimates: Floats, c: float) -> tuple[Indices, Indices, Floats]:
+def near_pairs(truth: Floats | Tree, estimates: Floats, c: float) -> tuple[Ints, Ints, Floats]:
     """All pairs of `truth` (T, d), or a tree of it, and `estimates` (M, d) closer than c: rows and columns (K,), by
     row and then column, and their distances (K,)."""
     places = truth.data if isinstance(truth, cKDTree) else truth
@@ -87,7 +85,7 @@ def near_pairs(truth: Floats | Tree, estimates: Floats, c: float) -> tuple[Indic
     return i[close], j[close], distance[close]
 
 
-def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[Indices, Indices, Floats]:
+def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[Ints, Ints, Floats]:
     """The assignment of (T, d) to (M, d) that both metrics use: rows and columns (K,) of its pairs closer than c, by
     row, and their distances (K,)."""
     i, j, d = near_pairs(truth, estimates, c)
@@ -95,7 +93,7 @@ def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[
     return i[kept], j[kept], d[kept]
 
 
-def assign_near(i: Indices, j: Indices, gain: Floats, shape: tuple[int, int]) -> Indices:
+def assign_near(i: Ints, j: Ints, gain: Floats, shape: tuple[int, int]) -> Ints:
     """Which of the pairs (i, j), by row and then column, are assigned: one for each row and each column at most, with
     the largest sum of gains, all above 0. In the order of the pairs.
 
@@ -117,7 +115,7 @@ def assign_near(i: Indices, j: Indices, gain: Floats, shape: tuple[int, int]) ->
     return np.sort(np.concatenate(chosen))
 
 
-def _best(i: Indices, j: Indices, gain: Floats) -> Indices:
+def _best(i: Ints, j: Ints, gain: Floats) -> Ints:
     """The same for one part, K > 0 pairs; in any order."""
     if len(i) == 2:  # they share a row or a column
         return np.array([int(gain[1] > gain[0])]) if i[0] == i[1] or j[0] == j[1] else np.arange(2)
@@ -130,13 +128,13 @@ def _best(i: Indices, j: Indices, gain: Floats) -> Indices:
         edges = np.concatenate([row, rows]), np.concatenate([column, len(others) + rows])
         matched = min_weight_full_bipartite_matching(coo_array((cost, edges)).tocsr())
         wanted = matched[0] * (len(others) + len(some)) + matched[1]
-        found: Indices = np.flatnonzero(np.isin(row * (len(others) + len(some)) + column, wanted))
+        found: Ints = np.flatnonzero(np.isin(row * (len(others) + len(some)) + column, wanted))
         return found
     worth = np.zeros((len(some), len(others)))
     worth[row, column] = gain
     pair = np.full(worth.shape, -1)
     pair[row, column] = np.arange(len(i))
-    kept: Indices = pair[linear_sum_assignment(worth, maximize=True)]
+    kept: Ints = pair[linear_sum_assignment(worth, maximize=True)]
     return kept[kept >= 0]
 
 

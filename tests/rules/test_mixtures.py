@@ -323,7 +323,7 @@ def test_blocks_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
         Mixtures.of([random_mixture(rng, C, 2) for C in counts]) for counts in ((2, 1, 3, 1, 1), (1, 3, 3, 1, 1))
     ]
     whole, w = fuse_mixtures_last("gm-ga", sources)
-    monkeypatch.setattr("fusion_service.rules.mixtures.AT_ONCE", 18)
+    monkeypatch.setattr("fusion_service.rules.mixtures.face.fusing.AT_ONCE", 18)
     parts, v = fuse_mixtures_last("gm-ga", sources)
     np.testing.assert_array_equal(v, w)
     for i in range(5):
