@@ -40,7 +40,7 @@ class DensityError(ValueError):
     """What is no mixture, or a reduction that cannot be done: one line that says what and why."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Mixture:
     """One Gaussian mixture, checked and copied. Raises DensityError for what is none."""
 
@@ -51,10 +51,10 @@ class Mixture:
     covariances: Floats
     """(C, n, n), symmetric positive definite"""
 
-    def __post_init__(self) -> None:
-        for name in ("weights", "means", "covariances"):
+    def __init__(self, weights: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
+        for name, given in (("weights", weights), ("means", means), ("covariances", covariances)):
             try:
-                value = np.array(getattr(self, name), dtype=np.float64)
+                value = np.array(given, dtype=np.float64)
             except (TypeError, ValueError) as error:
                 raise DensityError(f"{name} are not an array of numbers: {error}") from None
             if not np.isfinite(value).all():
