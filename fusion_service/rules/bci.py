@@ -19,7 +19,7 @@ from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats
 from fusion_service.linalg import inner
 from fusion_service.rules.base.block import Result, Sources, weighted_product
-from fusion_service.rules.base.matrices import weighted_sum
+from fusion_service.rules.base.matrices import fill_upper, weighted_sum
 from fusion_service.rules.base.options import CRITERION, Case, Option, RuleError, array
 from fusion_service.rules.base.rule import Rule
 from fusion_service.rules.base.scales import SCALES, in_scales
@@ -108,7 +108,7 @@ class Coupled:
         own = self.A / crowd
         pull = own * (w / crowd)
         others = np.stack([weighted_sum(pull, self.R[:, j, None]) for j in range(len(w))], axis=2)
-        return weighted_sum(own, w), own - others
+        return weighted_sum(own, w), own - fill_upper(others)
 
     def bend(self, w: Floats, G: Floats) -> None:
         return None

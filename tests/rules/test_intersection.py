@@ -112,6 +112,23 @@ def test_bounds_of_zero_and_one_are_naive_and_ci() -> None:
     np.testing.assert_allclose(fuse("bci", x, P, max_correlation=0.0).weights, np.full(3, 1 / 3))
 
 
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_bits_under_a_matrix_of_bounds_are_those_of_the_numbers(criterion: str) -> None:
+    """Not of what stood in memory before: the upper triangle of a derivative was once read and never written."""
+    drawn = [sources(np.random.default_rng(SEED + i), 3, 3) for i in range(40)]
+    x, P = (np.stack(a) for a in zip(*drawn, strict=True))
+    R = np.array([[1.0, 0.8, 0.8], [0.8, 1.0, 0.5], [0.8, 0.5, 1.0]])
+    results = []
+    for junk in (0.0, 1e3, -1.0, np.nan):
+        for size in (40, 9 * 40, 27 * 40):
+            np.full(size, junk)
+        results.append(fuse("bci", x, P, max_correlation=R, criterion=criterion))
+    alone = fuse("bci", x[7], P[7], max_correlation=R, criterion=criterion)
+    for fused in results:
+        np.testing.assert_array_equal(fused.weights, results[0].weights)
+        np.testing.assert_array_equal(fused.weights[7], alone.weights)
+
+
 def test_the_criterion_rises_with_the_bound() -> None:
     x, P = sources(np.random.default_rng(SEED), 3, 3)
     for criterion in CRITERIA:
