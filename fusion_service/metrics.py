@@ -16,6 +16,7 @@ from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints
 
 __all__ = [
+    "DENSE",
     "Gospa",
     "assign",
     "assign_near",

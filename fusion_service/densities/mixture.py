@@ -22,6 +22,7 @@ from fusion_service.arrays import Bools, Floats
 from fusion_service.linalg import total
 
 __all__ = [
+    "LOG_2PI",
     "DensityError",
     "Mixture",
     "Mixtures",
