@@ -59,6 +59,9 @@ def fuse_existence(
 
     "average": sum w_i r_i. "geometric" (Uney (21)): prod r_i^w_i z / (prod (1-r_i)^w_i + prod r_i^w_i z) with
     z = `overlap` (...), which it needs. `weights` (..., N), uniform if not given.
+
+    Raises ExistenceError for what is no probability or weight, an unknown method, and under "geometric" for sources
+    that are certain of the contrary.
     """
     p = _array("existence", r, 1, 1.0)
     if _check(method, weights, overlap) == "consistent":
@@ -86,6 +89,8 @@ def fuse_poisson(
 
     "consistent" (Uney (52), (53), corrected): the logarithmic mean (b - a) / ln(b/a) of the smallest and the largest.
     "geometric" (Uney (30), with the z it lacks): prod lambda_i^w_i z.
+
+    Raises ExistenceError for what is no rate or weight.
     """
     x = _array("rates", rates, 1, np.inf)
     if _check(method, weights, overlap) == "consistent":
@@ -138,25 +143,31 @@ def fuse_cardinality(
 
 
 def cardinality_map(p: ArrayLike) -> Ints:
-    """Most probable number (...) of p (..., K); the smallest of equals."""
+    """Most probable number (...) of p (..., K); the smallest of equals. Raises ExistenceError for no probabilities."""
     return np.asarray(_array("pmf", p, 1, 1.0).argmax(axis=-1))
 
 
 def cardinality_mean(p: ArrayLike) -> Floats:
-    """Expected number (...) of p (..., K)."""
+    """Expected number (...) of p (..., K). Raises ExistenceError for what are no probabilities."""
     a = _array("pmf", p, 1, 1.0)
     return _sum(a * np.arange(a.shape[-1]))
 
 
 def lower_existence(r: ArrayLike, p: ArrayLike) -> Floats:
-    """Existence (...) after a scan without a report where the detection probability is p: r (1-p) / (1 - r p)."""
+    """Existence (...) after a scan without a report where the detection probability is p: r (1-p) / (1 - r p).
+
+    Raises ExistenceError for what are no probabilities.
+    """
     a, b = _array("existence", r, 0, 1.0), _array("detection probability", p, 0, 1.0)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(a * b < 1.0, a * (1.0 - b) / (1.0 - a * b), 0.0))
 
 
 def loses_existence(r: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> Bools:
-    """Where (...) the exponential mixture of r (..., N) believes less in the target than every source (Uney (17))."""
+    """Where (...) the exponential mixture of r (..., N) believes less in the target than every source (Uney (17)).
+
+    Raises ExistenceError as `fuse_existence`.
+    """
     fused = fuse_existence(r, "geometric", weights=weights, overlap=overlap)
     return _below(fused, _array("existence", r, 1, 1.0).min(axis=-1))
 
@@ -164,14 +175,18 @@ def loses_existence(r: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None 
 def loses_rate(rates: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> Bools:
     """Where (...) the exponential mixture of Poissons expects fewer than every source (Uney (31)).
 
-    Uney's (32), z < min / max of the rates, is sufficient for that but not necessary.
+    Uney's (32), z < min / max of the rates, is sufficient for that but not necessary. Raises ExistenceError as
+    `fuse_poisson`.
     """
     fused = fuse_poisson(rates, "geometric", weights=weights, overlap=overlap)
     return _below(fused, _array("rates", rates, 1, np.inf).min(axis=-1))
 
 
 def loses_cardinality(pmfs: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> Bools:
-    """For which numbers (..., K) the exponential mixture of IID clusters is below every source (Uney (17), (33))."""
+    """For which numbers (..., K) the exponential mixture of IID clusters is below every source (Uney (17), (33)).
+
+    Raises ExistenceError as `fuse_cardinality`.
+    """
     fused, _ = fuse_cardinality(pmfs, "geometric", weights=weights, overlap=overlap)
     return _below(fused, _array("pmfs", pmfs, 2, 1.0).min(axis=-2))
 
@@ -181,6 +196,7 @@ def loss_bound(pmfs: ArrayLike, scales: ArrayLike, weights: ArrayLike | None = N
 
     pmfs (..., N, K), scales (..., K) the z(n) of Uney (14), z(0) = 1: Uney (18). For IID clusters scales = z^n, and
     the n-th root is then compared with z as in (33). Infinite where the weighted geometric mean is not above the least.
+    Raises ExistenceError for what are no probabilities or weights.
     """
     p, z = _array("pmfs", pmfs, 2, 1.0), _array("scales", scales, 1, 1.0)
     w = _weights(weights, p.shape[:-1])
@@ -197,6 +213,7 @@ def loss_threshold(pmfs: ArrayLike, overlap: ArrayLike, weights: ArrayLike | Non
 
     ln(N gamma) / ln z with N = sum prod p_i^w_i z^n and gamma = min_n min_i p_i / prod p_i^w_i, of numbers that all
     sources allow. Infinite for z = 1: nothing need be lost.
+    Raises ExistenceError for what are no probabilities or weights.
     """
     p, z = _array("pmfs", pmfs, 2, 1.0), _array("overlap", overlap, 0, 1.0)
     w = _weights(weights, p.shape[:-1])

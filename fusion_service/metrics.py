@@ -158,7 +158,7 @@ def nees_bounds(n: int, samples: int, probability: float = 0.95) -> tuple[float,
 
     For a consistent estimate n * samples * average is chi-square with n * samples degrees of freedom
     (Bar-Shalom, Li, Kirubarajan, 2001, 5.4.2). Errors along one track are correlated: there the true
-    bounds are wider.
+    bounds are wider. Raises ValueError for n or samples below 1, or a probability not between 0 and 1.
     """
     if n < 1 or samples < 1 or not 0 < probability < 1:
         raise ValueError(f"bounds need n, samples >= 1 and 0 < probability < 1: {n}, {samples}, {probability}")

@@ -119,7 +119,7 @@ class Mixtures:
 
     @classmethod
     def of(cls, mixtures: Sequence[Mixture]) -> Mixtures:
-        """One batch of mixtures of one state dimension."""
+        """One batch of mixtures of one state dimension; DensityError if they have several, or none is given."""
         if len({m.means.shape[1] for m in mixtures}) != 1:
             raise DensityError("one batch needs mixtures of one state dimension")
         counts = np.array([len(m.weights) for m in mixtures])

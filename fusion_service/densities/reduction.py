@@ -46,7 +46,7 @@ def reduce_mixture(
 def reduce_mixtures(
     mixtures: Mixtures, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
 ) -> Mixtures:
-    """`reduce_mixture` of many at once."""
+    """`reduce_mixture` of many at once. Raises DensityError for a method or limits that are none."""
     if method not in METHODS:
         raise DensityError(f"method {method!r}: one of {', '.join(METHODS)}")
     if max_components is not None and max_components < 1:

@@ -38,10 +38,12 @@ class Sources:
 
     @property
     def count(self) -> int:
+        """N."""
         return int(self.means.shape[1])
 
     @property
     def fast(self) -> bool:
+        """Whether this is the fast road, in float64."""
         return self.covariances.dtype == np.float64
 
     @property

@@ -86,7 +86,7 @@ def checked(takes: Mapping[str, Option], given: Mapping[str, Any], case: Case) -
 
 
 def one_of(*known: str) -> Check:
-    """The check that a value is one of these words."""
+    """The check that a value is one of these words: RuleError if not."""
 
     def check(name: str, value: Any, case: Case) -> Any:
         if value not in known:
@@ -97,7 +97,7 @@ def one_of(*known: str) -> Check:
 
 
 def whole(least: int) -> Check:
-    """The check that a value is a whole number and not too small."""
+    """The check that a value is a whole number and not too small: RuleError if not."""
 
     def check(name: str, value: Any, case: Case) -> Any:
         if not (isinstance(value, int | np.integer) and value >= least):
@@ -108,7 +108,7 @@ def whole(least: int) -> Check:
 
 
 def in_range(good: Callable[[float], bool], words: str) -> Check:
-    """The check that a value is one number that is `good`; `words` say which are."""
+    """The check that a value is one number that is `good`, RuleError if not; `words` say which are."""
 
     def check(name: str, value: Any, case: Case) -> Any:
         if not good(number(name, value)):

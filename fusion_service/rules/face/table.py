@@ -50,7 +50,7 @@ def written(page: str, text: str) -> str:
 
 
 def main() -> None:
-    """Write the pages below the current folder."""
+    """Write the pages below the current folder. Raises ValueError as `written`, OSError for a missing page."""
     for page in PAGES:
         path = Path(page)
         path.write_text(written(page, path.read_text(encoding="utf-8")), encoding="utf-8")
