@@ -81,9 +81,7 @@ def test_autoferry_scores_as_in_the_running_system() -> None:
 
 
 def test_order_among_equal_times_does_not_matter() -> None:
-    told = [
-        one for one in mission()[0] if isinstance(one, SensorInfo) or one.sent <= radars.three_radars().start + 60e9
-    ]
+    told = [one for one in mission()[0] if isinstance(one, SensorInfo) or one.sent <= three_radars().start + 60e9]
     order = {name: number for number, name in enumerate(("radar3", "radar1", "radar2"))}
     other = sorted(told, key=lambda one: (one.sent, order[one.source]))
     assert [one.source for one in told] != [one.source for one in other]

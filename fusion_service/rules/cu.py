@@ -16,13 +16,18 @@ over the estimates is not enough, least of all for min.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray, inner, total, trace
-from fusion_service.rules.chain import alone
-from fusion_service.rules.sources import Result, Sources, condition
-from fusion_service.rules.weights.pencil import eigen, lower_inverse, pencil
+from fusion_service.arrays import Bools, Floats
+from fusion_service.linalg import condition, inner, total, trace
+from fusion_service.rules.base.block import Result, Sources, alone
+from fusion_service.rules.base.matrices import lower_inverse, spectral
+from fusion_service.rules.base.options import CRITERION, Option, one_of
+from fusion_service.rules.base.rule import Rule
+from fusion_service.rules.base.scales import SCALES, in_scales
+from fusion_service.rules.weights.pencil import eigen, pencil
+
+__all__ = ["RULE", "cu"]
 
 GAP = 2e-10
 FACTOR = 8.0
@@ -30,7 +35,7 @@ FACTOR = 8.0
 ROUNDS = 400
 
 
-def cu(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str, bound: str) -> Result:
+def cu(sources: Sources, weights: Floats | None, influence: bool, *, criterion: str, bound: str) -> Result:
     """Covariance union, `bound` "max" or "min"."""
     if sources.count == 1:
         return alone(sources, influence)
@@ -55,24 +60,28 @@ def cu(sources: Sources, weights: FloatArray | None, influence: bool, *, criteri
     return Result(sources.means[:, 0] + x, P, w, w if influence else None, worst, gap)
 
 
-def _join(criterion: str, U: FloatArray, W: FloatArray) -> tuple[FloatArray, FloatArray]:
+RULE = Rule(
+    name="cu",
+    order=13,
+    title="covariance union, `max` and `min`",
+    promise="conservative if one source is (max)",
+    source="covariance union (Uhlmann; Li-AA (7)-(9))",
+    fuse=in_scales(cu),
+    takes={"criterion": CRITERION, "scales": SCALES, "bound": Option("max", one_of("max", "min"))},
+)
+
+
+def _join(criterion: str, U: Floats, W: Floats) -> tuple[Floats, Floats]:
     """The smallest matrix above both, and what rounding grows by."""
     if criterion == "det":
         T, _, r, grown = pencil(U, W)
-        return _spectral(T, np.maximum(r, 1.0)), grown
+        return spectral(T, np.maximum(r, 1.0)), grown
     size, Q = eigen(W - U)
-    P = U + _spectral(Q, np.maximum(size, 0.0))
+    P = U + spectral(Q, np.maximum(size, 0.0))
     return P, np.abs(size).max(axis=0) / np.stack([P[k, k] for k in range(len(P))]).min(axis=0)
 
 
-def _spectral(T: FloatArray, values: FloatArray) -> FloatArray:
-    """T diag(values) T', for values >= 0."""
-    D = np.zeros_like(T)
-    D[range(len(T)), range(len(T))] = values
-    return linalg.congruence(T, D)
-
-
-def _smallest(criterion: str, start: FloatArray, U: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _smallest(criterion: str, start: Floats, U: Floats) -> tuple[Floats, Floats]:
     """The smallest P (n, n, B) above every U (n, n, N, B), and the gap (B,); `start` is one above them."""
     n, _, N, size = U.shape
     L, d = linalg.ldl(start)
@@ -107,9 +116,7 @@ def _smallest(criterion: str, start: FloatArray, U: FloatArray) -> tuple[FloatAr
     return np.where(no_worse, start, P), np.where(no_worse, 0.0, gap)
 
 
-def _newton(
-    X: FloatArray, ends: FloatArray, C: FloatArray | None, t: FloatArray, sign: float
-) -> tuple[FloatArray, NDArray[np.bool_], NDArray[np.bool_]]:
+def _newton(X: Floats, ends: Floats, C: Floats | None, t: Floats, sign: float) -> tuple[Floats, Bools, Bools]:
     """One damped Newton step of t c(X) - sum log det sign (X - ends_i); whether it was a small one, or none.
 
     c is trace C X, or -log det X where C is None.
@@ -140,9 +147,9 @@ def _newton(
     for value, (a, b) in zip(step, pairs, strict=True):
         D[a, b] = D[b, a] = value
 
-    def height(X: FloatArray) -> FloatArray:
+    def height(X: Floats) -> Floats:
         slack = total(linalg.logdet(sign * (X[:, :, None] - ends)))
-        out: FloatArray = (t * inner(C, X) if C is not None else -t * linalg.logdet(X)) - slack
+        out: Floats = (t * inner(C, X) if C is not None else -t * linalg.logdet(X)) - slack
         return out
 
     here, length = height(X), np.ones_like(t)

@@ -1,4 +1,4 @@
-"""The face of the rules: the registry, the checks at the border, and the road a fusion takes.
+"""Fusing Gaussians by a rule of the registry: the checks at the border, and the road a fusion takes.
 
 Every fusion is computed in float64. Where the matrices inverted on the way are so ill-conditioned that
 the result could be wrong by more than about 1e-8, or weights cannot be certified as optimal, that one
@@ -8,24 +8,27 @@ that, and 1e-6 is enough there.
 (Where longdouble is no wider than double, everything that needs it is refused.)
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import prod
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray
-from fusion_service.rules.options import RuleError, array, at, checked
-from fusion_service.rules.registry import FUNCTIONS, RULES
-from fusion_service.rules.sources import Result, Sources
+from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.rules.base.block import Result, Sources
+from fusion_service.rules.base.options import Case, RuleError, array, checked
+from fusion_service.rules.base.rule import Rule
+from fusion_service.rules.face.registry import RULES
 from fusion_service.rules.weights.simplex import GAP
+
+__all__ = ["Fused", "fuse", "fuse_last"]
 
 FAST_CONDITION = 1e7
 SAFE_CONDITION = 4e12 if np.finfo(np.longdouble).eps < 2e-19 else 0.0
-"""Largest condition (see `sources.condition`) accepted in float64 and in longdouble."""
+"""Largest condition (see `linalg.condition`) accepted in float64 and in longdouble."""
 SAFE_GAP = 1e-6
 """Optimality gap of the weights that is accepted in longdouble."""
 
@@ -34,13 +37,13 @@ SAFE_GAP = 1e-6
 class Fused:
     """Fused Gaussians. Batch first from `fuse`, as below; batch last from `fuse_last`."""
 
-    mean: FloatArray
+    mean: Floats
     """(..., n)"""
-    covariance: FloatArray
+    covariance: Floats
     """(..., n, n), exactly symmetric, positive definite"""
-    weights: FloatArray
+    weights: Floats
     """(..., N), the weights of the rule's own formula; NaN where it has none"""
-    influence: FloatArray | None
+    influence: Floats | None
     """(..., N): trace(K_i) / n, K_i the gain of source i in the fused mean, weights held. Sums to 1. None
     unless asked for with `influence=True`; NaN for the sampled rules, which have no gain."""
 
@@ -74,7 +77,7 @@ def fuse(
     if not N or not n:
         raise RuleError(f"means {x.shape}: at least one source and one component are needed")
     shape = tuple(batch)
-    function, chosen = _prepare(rule, options, N, n, shape, last=False)
+    declared, chosen = _prepare(Case(rule, N, n, shape, last=False), options)
     w = _weights(rule, weights, (*shape, N))
     size = prod(shape)
     x, P = x.reshape(size, N, n), P.reshape(size, N, n, n)
@@ -83,7 +86,7 @@ def fuse(
     for part in _parts(size, N, n):
         xs, Ps = _last(x[part]), _last(P[part])
         _symmetric(Ps, part.start, shape)
-        result = _run(function, xs, Ps, None if w is None else w[part].T, influence, at(chosen, part))
+        result = _run(declared, xs, Ps, None if w is None else w[part].T, influence, declared.part(chosen, part))
         if not (np.isfinite(result.covariance[0, 0]).all() and np.isfinite(result.mean).all()):
             raise RuleError(_complaint(rule, xs, Ps, result, part.start, shape))
         count = (len(result.condition),)
@@ -102,9 +105,9 @@ def fuse(
 
 def fuse_last(
     rule: str,
-    means: FloatArray,
-    covariances: FloatArray,
-    weights: FloatArray | None = None,
+    means: Floats,
+    covariances: Floats,
+    weights: Floats | None = None,
     *,
     influence: bool = False,
     **options: Any,
@@ -117,7 +120,7 @@ def fuse_last(
     on the others. Raises RuleError for an unknown rule or option, and nothing else.
     """
     N, n, size = means.shape
-    function, chosen = _prepare(rule, options, N, n, (size,), last=True)
+    declared, chosen = _prepare(Case(rule, N, n, (size,), last=True), options)
     fused = Fused(
         np.empty((n, size)),
         np.empty((n, n, size)),
@@ -126,7 +129,7 @@ def fuse_last(
     )
     for part in _parts(size, N, n):
         w = None if weights is None else weights[:, part]
-        result = _run(function, means[..., part], covariances[..., part], w, influence, at(chosen, part))
+        result = _run(declared, means[..., part], covariances[..., part], w, influence, declared.part(chosen, part))
         fused.mean[:, part] = result.mean
         fused.covariance[..., part] = result.covariance
         fused.weights[:, part] = result.weights
@@ -135,7 +138,7 @@ def fuse_last(
     return fused
 
 
-def _last(a: FloatArray) -> FloatArray:
+def _last(a: Floats) -> Floats:
     """(B, N, ...) -> (N, ..., B), in memory (..., N, B), as `Sources` has it."""
     size, N, *core = a.shape
     out = np.empty((*core, N, size))
@@ -150,17 +153,17 @@ def _parts(size: int, N: int, n: int) -> Iterator[slice]:
 
 
 def _run(
-    function: Callable[..., Result],
-    means: FloatArray,
-    covariances: FloatArray,
-    weights: FloatArray | None,
+    rule: Rule,
+    means: Floats,
+    covariances: Floats,
+    weights: Floats | None,
     influence: bool,
     chosen: dict[str, Any],
 ) -> Result:
     """One block; what float64 cannot carry again in longdouble, and NaN where this is not good enough."""
     with np.errstate(all="ignore"):
         sources = Sources.of(means, covariances)
-        result = function(sources, weights, influence, **chosen)
+        result = rule.fuse(sources, weights, influence, **chosen)
         limit = FAST_CONDITION if sources.fast else SAFE_CONDITION
         enough = GAP if sources.fast else SAFE_GAP
         doubtful = ~((result.condition <= limit) & (result.gap <= enough) & sources.definite)
@@ -178,19 +181,19 @@ def _run(
         if sources.fast:
             w = None if weights is None else _wide(weights[:, bad])
             x, P = _wide(means[..., bad]), _wide(covariances[..., bad])
-            again = _run(function, x, P, w, influence, at(chosen, bad))
+            again = _run(rule, x, P, w, influence, rule.part(chosen, bad))
             _overwrite(result, bad, again.mean, again.covariance, again.weights, again.influence)
         else:
             _overwrite(result, bad, np.nan, np.nan, np.nan, np.nan)
         return result
 
 
-def _wide(a: FloatArray) -> FloatArray:
+def _wide(a: Floats) -> Floats:
     out: Any = a.astype(np.longdouble)
     return out  # type: ignore[no-any-return]
 
 
-def _overwrite(result: Result, at: NDArray[np.intp], mean: Any, covariance: Any, weights: Any, share: Any) -> None:
+def _overwrite(result: Result, at: Ints, mean: Any, covariance: Any, weights: Any, share: Any) -> None:
     result.mean[:, at] = mean
     result.covariance[..., at] = covariance
     result.weights[:, at] = weights
@@ -198,23 +201,18 @@ def _overwrite(result: Result, at: NDArray[np.intp], mean: Any, covariance: Any,
         result.influence[:, at] = share
 
 
-def _prepare(
-    rule: str, given: dict[str, Any], N: int, n: int, batch: tuple[int, ...], *, last: bool
-) -> tuple[Callable[..., Result], dict[str, Any]]:
-    if rule not in RULES:
-        raise RuleError(f"unknown rule {rule!r}: one of {', '.join(RULES)}")
-    known = RULES[rule].options
-    for name in given:
-        if name not in known:
-            raise RuleError(f"rule {rule!r} has no option {name!r}: it has {', '.join(known) or 'none'}")
-    return FUNCTIONS[rule], checked(rule, {**known, **given}, N, n, batch, last=last)
+def _prepare(case: Case, given: dict[str, Any]) -> tuple[Rule, dict[str, Any]]:
+    """The rule that is asked for, and its options, checked."""
+    if case.rule not in RULES:
+        raise RuleError(f"unknown rule {case.rule!r}: one of {', '.join(RULES)}")
+    return RULES[case.rule], checked(RULES[case.rule].takes, given, case)
 
 
-def _weights(rule: str, weights: ArrayLike | str | None, shape: tuple[int, ...]) -> FloatArray | None:
+def _weights(rule: str, weights: ArrayLike | str | None, shape: tuple[int, ...]) -> Floats | None:
     """(size, N), checked."""
     if weights is None:
         return None
-    if rule in RULES and not RULES[rule].takes_weights:
+    if not RULES[rule].takes_weights:
         raise RuleError(f"rule {rule!r} takes no weights")
     if isinstance(weights, str):
         if weights != "uniform":
@@ -230,7 +228,7 @@ def _weights(rule: str, weights: ArrayLike | str | None, shape: tuple[int, ...])
     return w.reshape(prod(shape[:-1]), shape[-1])
 
 
-def _symmetric(P: FloatArray, start: int, batch: tuple[int, ...]) -> None:
+def _symmetric(P: Floats, start: int, batch: tuple[int, ...]) -> None:
     """Raise unless every P (N, n, n, B) is symmetric up to rounding. NaN passes: it is found later."""
     for i in range(1, P.shape[1]):
         lower, upper = P[:, i, :i], P[:, :i, i]
@@ -245,10 +243,10 @@ def _symmetric(P: FloatArray, start: int, batch: tuple[int, ...]) -> None:
 
 
 def _complaint(
-    rule: str, means: FloatArray, covariances: FloatArray, result: Result, start: int, batch: tuple[int, ...]
+    rule: str, means: Floats, covariances: Floats, result: Result, start: int, batch: tuple[int, ...]
 ) -> str:
     """Why an element came back as NaN."""
-    definite: NDArray[np.bool_] = linalg.is_positive_definite(covariances.transpose(1, 2, 0, 3))
+    definite: Bools = linalg.is_positive_definite(covariances.transpose(1, 2, 0, 3))
     for problem, bad in (
         ("mean of {} is not finite", ~np.isfinite(means).all(axis=1)),
         ("covariance of {} is not finite", ~np.isfinite(covariances).all(axis=(1, 2))),

@@ -12,29 +12,31 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray
-from fusion_service.rules.sources import Result, Sources, condition
+from fusion_service.arrays import Floats, Ints
+from fusion_service.linalg import condition
+from fusion_service.rules.base.block import Result, Sources, alone
+
+__all__ = ["Pair", "pairwise"]
 
 
 @dataclass(frozen=True, slots=True)
 class Pair:
     """Two sources, fused."""
 
-    mean: FloatArray  # (n, B)
-    covariance: FloatArray  # (n, n, B)
-    weights: FloatArray  # (2, B)
-    gain: FloatArray | None  # (n, n, B), of the second source, if asked for
-    condition: FloatArray  # (B,)
-    gap: FloatArray  # (B,)
+    mean: Floats  # (n, B)
+    covariance: Floats  # (n, n, B)
+    weights: Floats  # (2, B)
+    gain: Floats | None  # (n, n, B), of the second source, if asked for
+    condition: Floats  # (B,)
+    gap: Floats  # (B,)
 
 
-Step = Callable[[Sources, FloatArray | None, bool], Pair]
+Step = Callable[[Sources, Floats | None, bool], Pair]
 
 
-def canonical(sources: Sources) -> NDArray[np.intp]:
+def canonical(sources: Sources) -> Ints:
     """For each element the sources in canonical order (N, B)."""
     n = len(sources.means)
     entries = [sources.covariances[i, j] for i in range(n) for j in range(i + 1)]
@@ -42,7 +44,7 @@ def canonical(sources: Sources) -> NDArray[np.intp]:
     return np.asarray(np.lexsort(keys[::-1], axis=0))
 
 
-def in_order(sources: Sources, order: NDArray[np.intp]) -> Sources:
+def in_order(sources: Sources, order: Ints) -> Sources:
     """The sources of each element, rearranged."""
     means = np.take_along_axis(sources.means, order[None], axis=1)
     P, A = (np.take_along_axis(a, order[None, None], axis=2) for a in (sources.covariances, sources.information))
@@ -50,20 +52,7 @@ def in_order(sources: Sources, order: NDArray[np.intp]) -> Sources:
     return Sources(means, P, A, dets, sources.condition, sources.definite)
 
 
-def alone(sources: Sources, influence: bool) -> Result:
-    """One source, as it is."""
-    one = np.ones_like(sources.means[0])
-    return Result(
-        sources.means[:, 0],
-        sources.covariances[:, :, 0],
-        one,
-        one if influence else None,
-        sources.condition,
-        np.zeros_like(sources.condition),
-    )
-
-
-def pairwise(step: Step, sources: Sources, weights: FloatArray | None, influence: bool) -> Result:
+def pairwise(step: Step, sources: Sources, weights: Floats | None, influence: bool) -> Result:
     """Any number of sources by a rule for two."""
     N, n = sources.count, len(sources.means)
     if N == 1:
@@ -105,7 +94,7 @@ def pairwise(step: Step, sources: Sources, weights: FloatArray | None, influence
     return Result(mean, P, out, shares, worst, gap)
 
 
-def _two(mean: FloatArray, P: FloatArray, sources: Sources, k: int) -> Sources:
+def _two(mean: Floats, P: Floats, sources: Sources, k: int) -> Sources:
     A, det, _ = linalg.sweep(P)
     return Sources(
         np.stack([mean, sources.means[:, k]], axis=1),

@@ -20,20 +20,25 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray, inner, total
-from fusion_service.rules.harmonic import Mixture
-from fusion_service.rules.inverse import root
-from fusion_service.rules.sources import Result, Sources
+from fusion_service.arrays import Bools, Floats
+from fusion_service.linalg import inner, total
+from fusion_service.rules.base.block import Result, Sources
+from fusion_service.rules.base.matrices import fill_upper
+from fusion_service.rules.base.options import Option, one_of
+from fusion_service.rules.base.rule import Rule
 from fusion_service.rules.weights import search, simplex
+from fusion_service.rules.weights.mixture_covariance import MixtureCovariance
 from fusion_service.rules.weights.pencil import pencil
+from fusion_service.rules.weights.root import root, slopes_at_ends
+
+__all__ = ["RULE", "aa"]
 
 
-def aa(sources: Sources, weights: FloatArray | None, influence: bool, *, criterion: str) -> Result:
+def aa(sources: Sources, weights: Floats | None, influence: bool, *, criterion: str) -> Result:
     """Arithmetic average, merged."""
-    mixture = Mixture(sources.covariances, sources.spread)
+    mixture = MixtureCovariance(sources.covariances, sources.spread)
     w, gap, condition = weights, np.zeros_like(sources.condition), np.ones_like(sources.condition)
     if w is None and (criterion == "uniform" or sources.count == 1):
         w = sources.uniform
@@ -46,28 +51,31 @@ def aa(sources: Sources, weights: FloatArray | None, influence: bool, *, criteri
         M, D = model(w)
         gap, condition = simplex.gap(w, simplex.gradient("det", linalg.inverse(M), D)), sources.condition
     return Result(
-        sources.means[:, 0] + mixture.mean(w), _full(mixture(w)[0]), w, w if influence else None, condition, gap
+        sources.means[:, 0] + mixture.mean(w), fill_upper(mixture(w)[0]), w, w if influence else None, condition, gap
     )
 
 
-def _full(P: FloatArray) -> FloatArray:
-    """Fill the upper triangle of P from the lower."""
-    for i in range(1, len(P)):
-        P[:i, i] = P[i, :i]
-    return P
+RULE = Rule(
+    name="aa",
+    order=12,
+    title="arithmetic average; uniform, diversity or bound weights",
+    promise="fault tolerant; a mixture keeps modes",
+    source="arithmetic average, merged: Li-AA (5), (10), (40), (45)",
+    fuse=aa,
+    takes={"criterion": Option("uniform", one_of("uniform", "diversity", "bound"))},
+)
 
 
-def _of_two(sources: Sources) -> FloatArray:
+def _of_two(sources: Sources) -> Floats:
     """Diversity weights (2, B), where both covariances are diagonal and the first is I."""
     P = sources.covariances
     _, inverse, r, _ = pencil(P[:, :, 0], P[:, :, 1])
     d = linalg.matvec(inverse, sources.spread[:, 1])
     data = np.stack([r, d * d, np.log(r)], axis=1)
-    ends = (_diversity_slope(np.full_like(r[0], t), np.full_like(r[0], 1.0 - t), data)[0] for t in (0.0, 1.0))
-    return root(_diversity_slope, data, *ends)
+    return root(_diversity_slope, data, *slopes_at_ends(_diversity_slope, data))
 
 
-def _diversity_slope(t: FloatArray, u: FloatArray, data: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _diversity_slope(t: Floats, u: Floats, data: Floats) -> tuple[Floats, Floats]:
     """First and second derivative of sum w_i log det P_i - log det P_AA at w = (t, 1 - t).
 
     With g = t + (1-t) r: det P_AA = prod g (1 + t(1-t) q), q = sum d^2 / g.
@@ -86,20 +94,20 @@ def _diversity_slope(t: FloatArray, u: FloatArray, data: FloatArray) -> tuple[Fl
 class Tilted:
     """P_AA(w) exp(-c'w / n): minus its log-determinant is c'w - log det P_AA(w), convex in w."""
 
-    mixture: Mixture
-    c: FloatArray  # (N, B)
+    mixture: MixtureCovariance
+    c: Floats  # (N, B)
 
-    def _scale(self, w: FloatArray) -> FloatArray:
-        out: FloatArray = np.exp(-total(self.c * w) / len(self.mixture.C))
+    def _scale(self, w: Floats) -> Floats:
+        out: Floats = np.exp(-total(self.c * w) / len(self.mixture.C))
         return out
 
-    def __call__(self, w: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def __call__(self, w: Floats) -> tuple[Floats, Floats]:
         M, D = self.mixture(w)
         s = self._scale(w)
-        M = _full(M)
+        M = fill_upper(M)
         return M * s, (D - M[:, :, None] * (self.c / len(M))) * s
 
-    def bend(self, w: FloatArray, G: FloatArray) -> FloatArray:
+    def bend(self, w: Floats, G: Floats) -> Floats:
         s, n = self._scale(w), len(G)
         _, D = self.mixture(w)
         t, lean = inner((G * s)[:, :, None], D) - 0.5 * self.c, self.c / n
@@ -107,7 +115,7 @@ class Tilted:
         free = n + total(t * t)
         return self.mixture.bend(w, G * s) + lean[:, None] * t + t[:, None] * lean + free
 
-    def take(self, index: NDArray[np.bool_]) -> Self:
+    def take(self, index: Bools) -> Self:
         return replace(self, mixture=self.mixture.take(index), c=self.c[:, index])
 
 
@@ -123,8 +131,8 @@ def _bound(sources: Sources) -> search.Cost:
     z = np.exp(log_z - height[:, None])
     offset = 0.5 * np.log(sources.dets) + height
 
-    def cost(w: FloatArray) -> FloatArray:
-        out: FloatArray = total(w * (offset + np.log(linalg.matvec(z, w))))
+    def cost(w: Floats) -> Floats:
+        out: Floats = total(w * (offset + np.log(linalg.matvec(z, w))))
         return out
 
     return cost

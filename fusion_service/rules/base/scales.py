@@ -4,21 +4,38 @@ Option `scales` (n,): the rule works in the state divided by it, component by co
 scale is large counts little. det and KL do not depend on units.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from fusion_service.linalg import FloatArray
-from fusion_service.rules.sources import Result, Sources
+from fusion_service.arrays import Floats
+from fusion_service.rules.base.block import Result, Sources
+from fusion_service.rules.base.options import Case, Option, RuleError, array
+
+__all__ = ["SCALES", "in_scales"]
 
 
-def in_units(rule: Callable[..., Result]) -> Callable[..., Result]:
+def _check(name: str, value: Any, case: Case) -> Floats | None:
+    if value is None:
+        return None
+    scales = array(name, value)
+    if scales.shape != (case.n,) or not ((scales > 0.0) & np.isfinite(scales)).all():
+        raise RuleError(f"{name} {value!r}: {case.n} positive numbers, one unit for each component, are needed")
+    return scales
+
+
+SCALES = Option(None, _check)
+
+
+def in_scales(rule: Callable[..., Result]) -> Callable[..., Result]:
     """The rule with the option `scales`."""
 
     def scaled(
-        sources: Sources, weights: FloatArray | None, influence: bool, *, scales: FloatArray | None, **options: Any
+        sources: Sources, weights: Floats | None, influence: bool, *, scales: Floats | None, **options: Any
     ) -> Result:
         if scales is None:
             return rule(sources, weights, influence, **options)

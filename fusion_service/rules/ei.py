@@ -25,21 +25,37 @@ from dataclasses import replace
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray
-from fusion_service.rules.chain import Pair, pairwise
-from fusion_service.rules.sources import Result, Sources
+from fusion_service.arrays import Floats
+from fusion_service.rules.base.block import Result, Sources
+from fusion_service.rules.base.chain import Pair, pairwise
+from fusion_service.rules.base.matrices import spectral
+from fusion_service.rules.base.rule import Rule
 from fusion_service.rules.weights.pencil import pencil
+
+__all__ = ["RULE", "ei"]
 
 ETA = 1e-6
 
 
-def ei(sources: Sources, weights: FloatArray | None, influence: bool) -> Result:
+def ei(sources: Sources, weights: Floats | None, influence: bool) -> Result:
     """Ellipsoidal intersection."""
     result = pairwise(_pair, sources, None, influence)
     return replace(result, weights=np.full_like(result.weights, np.nan))
 
 
-def _pair(two: Sources, weights: FloatArray | None, influence: bool) -> Pair:
+RULE = Rule(
+    name="ei",
+    order=8,
+    title="ellipsoidal intersection, pairwise",
+    promise="none in general",
+    source="ellipsoidal intersection (Sijs and Lazar 2012); smallest det first",
+    fuse=ei,
+    n_way=False,
+    takes_weights=False,
+)
+
+
+def _pair(two: Sources, weights: Floats | None, influence: bool) -> Pair:
     T, inverse, r, grown = pencil(two.covariances[:, :, 0], two.covariances[:, :, 1])
     better = np.minimum(r, 1.0)
     small = ETA / (np.maximum(r, 1.0 / r) - 1.0 + 2.0 * ETA)
@@ -47,15 +63,9 @@ def _pair(two: Sources, weights: FloatArray | None, influence: bool) -> Pair:
     zero = np.zeros_like(grown)
     return Pair(
         two.means[:, 0] + linalg.matvec(gain, two.spread[:, 1]),
-        linalg.congruence(T, _diagonal(better)),
+        spectral(T, better),
         np.full_like(two.dets, 0.5),
         gain,
         10.0 * two.condition * grown,
         zero,
     )
-
-
-def _diagonal(x: FloatArray) -> FloatArray:
-    out = np.zeros((len(x), *x.shape), x.dtype)
-    out[range(len(x)), range(len(x))] = x
-    return out
