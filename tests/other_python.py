@@ -42,7 +42,9 @@ def tested(version: str, python: str) -> str:
         subprocess.run([python, "-m", "venv", here], check=True)
         install = [here / "bin" / "pip", "install", "-q", "--only-binary", ":all:", "-e", ".", *NEEDED]
         constraint = {"PIP_CONSTRAINT": str(ROOT / "constraints.txt")}
-        done = subprocess.run(install, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | constraint)
+        done = subprocess.run(
+            install, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | constraint
+        )
         if done.returncode:
             why = next((line for line in done.stderr.splitlines() if line.startswith("ERROR")), done.stderr[-300:])
             return f"skipped: {why}"

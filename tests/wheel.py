@@ -42,7 +42,9 @@ def run(*command: str | Path, code: int = 0, folder: Path) -> str:
     clean = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
     done = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False, cwd=folder, env=clean)
     if done.returncode != code:
-        sys.exit(f"{' '.join(map(str, command))}\nended with {done.returncode}, not {code}:\n{done.stdout}{done.stderr}")
+        sys.exit(
+            f"{' '.join(map(str, command))}\nended with {done.returncode}, not {code}:\n{done.stdout}{done.stderr}"
+        )
     return done.stdout + done.stderr
 
 
