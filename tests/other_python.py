@@ -40,7 +40,16 @@ def tested(version: str, python: str) -> str:
     here = ROOT / f".venv-{version}"
     if not (here / "ready").exists():
         subprocess.run([python, "-m", "venv", here], check=True)
-        install = [here / "bin" / "pip", "install", "-q", "--only-binary", ":all:", "-e", ".", *NEEDED]
+        install: list[str | Path] = [
+            here / "bin" / "pip",
+            "install",
+            "-q",
+            "--only-binary",
+            ":all:",
+            "-e",
+            ".",
+            *NEEDED,
+        ]
         constraint = {"PIP_CONSTRAINT": str(ROOT / "constraints.txt")}
         done = subprocess.run(
             install, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | constraint
