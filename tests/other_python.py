@@ -14,7 +14,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 KNOWN = range(11, 16)
-TESTS = ("tests/schemas", "tests/config", "tests/centre", "tests/rules/test_rule_properties.py")
+TESTS = (
+    "tests/schemas",
+    "tests/config",
+    "tests/centre/test_centre.py",
+    "tests/centre/test_clock.py",
+    "tests/rules/test_rule_properties.py",
+)
 NEEDED = ("hypothesis", "pytest", "pytest-xdist")
 VERSION = "import sys; print('%d.%d' % sys.version_info[:2])"
 

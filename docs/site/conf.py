@@ -28,6 +28,8 @@ python_maximum_signature_line_length = 88
 toc_object_entries_show_parents = "hide"
 
 CODE = re.compile(r"(`[^`]+`)")
+ARRAY = re.compile(r"[~\w.]*ndarray\[tuple\[[~\w.]*Any, \.\.\.\], [~\w.]*dtype\[([~\w.]+)\]\]")
+ARRAY_LIKE = re.compile(r"[~\w.]*Buffer \| [~\w.]*_SupportsArray.+?_NestedSequence\[complex \| bytes \| str\]")
 
 
 def restructured(lines: list[str]) -> list[str]:
@@ -78,8 +80,7 @@ def _signature(app: Any, what: str, name: str, thing: Any, options: Any, given: 
     """The names of array types as the code writes them."""
 
     def short(text: str | None) -> str | None:
-        text = text and re.sub(r"ndarray\[tuple\[Any, \.\.\.\], dtype\[(\w+)\]\]", r"NDArray[\1]", text)
-        return text and re.sub(r"_Buffer \| _SupportsArray.+?_NestedSequence\[complex \| bytes \| str\]", "ArrayLike", text)
+        return ARRAY.sub(r"NDArray[\1]", ARRAY_LIKE.sub("ArrayLike", text)) if text else text
 
     return short(given), short(result)
 
