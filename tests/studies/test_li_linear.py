@@ -26,7 +26,8 @@ def found() -> dict[str, Record]:
 
 def exact(kind: str) -> tuple[float, float]:
     """ARMSE of a filter whose gains do not depend on the data, from the recursion of its true error covariance."""
-    P = T = MODEL.covariance
+    P: Floats = MODEL.covariance
+    T: Floats = P
     out = []
     for _ in range(MODEL.steps):
         P, T = F @ P @ F.T + Q, F @ T @ F.T + Q

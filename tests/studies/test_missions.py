@@ -22,14 +22,14 @@ from studies.experiments import sharma_three_radars as radars
 from studies.rules import fuser
 from studies.study import MissingDataError, Result, Run
 
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "docs" / "measurements.md"
 DATA = data_folder("autoferry")
 needs_data = pytest.mark.skipif(not DATA, reason="FUSION_DATA names no folder of the Autoferry recordings")
 
 
 def table(head: str) -> dict[str, list[float]]:
-    """A table of the README, which `python -m benchmarks.missions` made of missions with all processes."""
-    lines = README.read_text("utf-8").splitlines()
+    """A table of docs/measurements.md, which `python -m benchmarks.missions` made of missions with all processes."""
+    lines = PAGE.read_text("utf-8").splitlines()
     start = next(number for number, line in enumerate(lines) if line.startswith(head))
     rows: dict[str, list[float]] = {}
     for line in lines[start + 2 :]:
