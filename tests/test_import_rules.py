@@ -21,7 +21,7 @@ GROUND_FLOOR = {
 }
 STANDS_ON = {
     "schemas": set(),
-    **{name: {*GROUND_FLOOR, "schemas", "fusion_service.densities"} for name in GROUND_FLOOR},
+    **{name: {*GROUND_FLOOR, "schemas", "fusion_service.densities"} for name in sorted(GROUND_FLOOR)},
     "fusion_service.densities": {*GROUND_FLOOR},
     "fusion_service.rules": {*GROUND_FLOOR, "fusion_service.densities"},
     "fusion_service.bus": {*GROUND_FLOOR, "schemas"},
