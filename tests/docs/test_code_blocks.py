@@ -229,6 +229,7 @@ def check_module(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatc
         assert arguments == [], name
         return
     monkeypatch.setattr(sys, "argv", [name, *arguments])
+    monkeypatch.delitem(sys.modules, name, raising=False)  # runpy warns of what another test imported
     with pytest.raises(Parsed):
         runpy.run_module(name, run_name="__main__")
 
