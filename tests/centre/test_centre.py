@@ -45,7 +45,11 @@ def test_same_events_same_bytes_in_any_order(rule: str, memory: str) -> None:
     first = bytes_of(mission(lambda batch: batch, rule=rule, memory=memory))
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        again = mission(lambda batch, r=rng: [batch[k] for k in r.permutation(len(batch))], rule=rule, memory=memory)
+
+        def shuffled(batch: list[Any], rng: np.random.Generator = rng) -> list[Any]:
+            return [batch[k] for k in rng.permutation(len(batch))]
+
+        again = mission(shuffled, rule=rule, memory=memory)
         assert bytes_of(again) == first
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -40,7 +42,7 @@ def test_the_exponential_mixture_loses_the_target() -> None:
     assert pair("geometric", aspect) == pytest.approx(0.8 * z / (0.2 + 0.8 * z), rel=1e-9)
 
 
-def watcher(radius: float, **changes: object) -> schemas.SensorInfo:
+def watcher(radius: float, **changes: Any) -> schemas.SensorInfo:
     return info("r2", coverage=schemas.Disk(radius), detection_probability=0.9, **changes)
 
 
