@@ -12,7 +12,7 @@ demo: $(VENV)/ready
 	$(BIN)/fusion-service demo $(ARGS)
 
 test: lint
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check -q .

@@ -141,8 +141,8 @@ def compared(gospa: Mapping[str, Floats]) -> Iterator[str]:
     yield (
         f"All rules lie between {fused[low]:+.3f} m ({low}) and {fused[high]:+.3f} m ({high}) of ci restart: little "
         f"beside the {np.ptp(gospa['ci restart']):.1f} m between scenes, and beside the 1 m by which the single "
-        "sensors move when their tuning does (README). A rule moves the localisation; which targets are missed and "
-        "which tracks are false is decided by the local trackers and the association."
+        "sensors move when their tuning does (docs/measurements.md). A rule moves the localisation; which targets are "
+        "missed and which tracks are false is decided by the local trackers and the association."
     )
     better: list[str] = []
     worse: list[str] = []
