@@ -111,7 +111,7 @@ def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entr
     fresh = rows.fresh[inside]
     says = np.isfinite(rows.tracks.existence[inside])
     hit = np.bincount(at[fresh], minlength=count) > 0
-    opinion = np.where(picture.time < 0, _logit(config.birth_existence), picture.opinion)
+    opinion = np.where(np.isnan(picture.opinion), _logit(config.birth_existence), picture.opinion)
     evidence = picture.evidence.copy()
     opinion = _opinions(rows, picture, inside[says], opinion, config.existence)
     gain = np.array([_gain(intake.declared(intake.sources[name])) for name in intake.names()])
@@ -196,7 +196,7 @@ def _missed(
         p = min(float(said.detection_probability or 0.0), MOST_CERTAIN)
         more = intake.sources[name].scans * np.log1p(-p)
         again = seen & ~says & (total < 0)
-        spent = spent + np.where(again, gain[index[name]], 0.0)
+        spent = spent + np.where(again, np.minimum(gain[index[name]], -total), 0.0)
         total = np.where(again, np.minimum(total + gain[index[name]], 0.0), np.where(says, 0.0, total))
         total = np.maximum(np.where(missed, total + more, total), -MOST)
         entries.keep(name, picture, since, total)
