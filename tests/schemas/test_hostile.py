@@ -29,6 +29,7 @@ ONE_OF_EACH = (
     "sensor_info_sector",
     "sensor_info_polygon",
     "global_tracks",
+    "global_tracks_identified",
     "step_log",
     "status",
     "truth",
