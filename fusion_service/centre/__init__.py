@@ -4,22 +4,32 @@ from fusion_service.centre.centre import Centre, StepResult
 from fusion_service.centre.checkpoint import CheckpointError
 from fusion_service.centre.clock import MessageClock, WallClock
 from fusion_service.centre.fusion import FusionCentre
-from fusion_service.centre.intake import Event, Order, Refused, SourceFound, SourceLost
+from fusion_service.centre.intake import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.intensity import IntensityCentre
+from fusion_service.centre.judging import Outcome, View, judge
 from fusion_service.centre.making import make_centre
+from fusion_service.centre.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
 
 __all__ = [
+    "NEEDED",
+    "WHAT",
     "Centre",
     "CheckpointError",
     "Event",
     "FusionCentre",
     "IntensityCentre",
+    "LocalId",
     "MessageClock",
     "Order",
+    "Outcome",
     "Refused",
     "SourceFound",
     "SourceLost",
     "StepResult",
+    "View",
     "WallClock",
+    "judge",
     "make_centre",
+    "order_of",
+    "read_order",
 ]

@@ -19,7 +19,7 @@ from schemas import Entry, Motion
 __all__ = ["predict_tracks", "usable_rows", "write_back"]
 
 PARTS = ("log_weight", "part_mean", "part_covariance")
-LINK_COLUMNS = ("link", "since", "fails", "used")
+LINK_COLUMNS = ("link", "since", "fails", "used", "told")
 
 
 def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:

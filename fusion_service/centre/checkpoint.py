@@ -14,10 +14,12 @@ import numpy as np
 
 from fusion_service.centre.lifecycle import Picture, empty_picture
 from fusion_service.centre.sources import Source, Tracks, empty_tracks, padded
+from fusion_service.centre.words import Lexicon, Words
 from schemas import Ecef, Enu, Frame, Local, SensorInfo, decode, encode
 
 if TYPE_CHECKING:
     from fusion_service.centre.intake import Intake
+    from fusion_service.centre.labels import Labels
 
 __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
 
@@ -26,6 +28,8 @@ _PLAIN = (
     *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
     *("origin", "waited", "highest", "first"),
 )
+_ADDED: dict[str, float] = {"identity": -1, "kind": -1, "kind_p": np.nan, "origin": 0, "told": -1}
+"""Columns that a checkpoint of this version may lack, and what they then hold."""
 Columns = TypeVar("Columns", Tracks, Picture)
 
 
@@ -33,7 +37,7 @@ class CheckpointError(ValueError):
     """A checkpoint that cannot be used, and why, in one line."""
 
 
-def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, picture: Picture) -> bytes:
+def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: Labels, picture: Picture) -> bytes:
     """The bytes of a checkpoint."""
     whole = {
         "v": CHECKPOINT_VERSION,
@@ -42,12 +46,15 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, picture:
         "frame": _pack_frame(intake.frame),
         "sources": {name: _pack_source(source) for name, source in sorted(intake.sources.items())},
         "picture": _pack_columns(picture),
+        "orders": intake.orders.kept(),
+        "labels": labels.kept(),
+        "said": [words.texts for words in intake.said],
         **state,
     }
     return cast(bytes, msgpack.packb(whole))
 
 
-def unpack_state(blob: bytes, intake: Intake, space: tuple[str, ...]) -> tuple[dict[str, Any], Picture]:
+def unpack_state(blob: bytes, intake: Intake, labels: Labels, space: tuple[str, ...]) -> tuple[dict[str, Any], Picture]:
     """Fill the intake, and return the rest and the picture. `CheckpointError` if it does not fit this centre."""
     try:
         whole = msgpack.unpackb(blob)
@@ -65,11 +72,17 @@ def unpack_state(blob: bytes, intake: Intake, space: tuple[str, ...]) -> tuple[d
         picture = _unpack_columns(whole["picture"], empty_picture(len(space)))
         numbers = {name: int(whole[name]) for name in ("step", "time", "next_id")}
         agreeing = {(int(a), int(b)): int(count) for a, b, count in whole["agreeing"]}
+        if "orders" in whole:
+            intake.orders.restore(whole["orders"])
+        if "labels" in whole:
+            labels.restore(whole["labels"])
+        intake.said = Lexicon(*(Words(texts) for texts in whole.get("said", [[], []])))
     except CheckpointError:
         raise
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources = frame or intake.config.frame, sources
+    intake.mute()
     return {**numbers, "agreeing": agreeing}, picture
 
 
@@ -111,6 +124,9 @@ def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
     arrays = []
     for one in fields(like):
         empty = getattr(like, one.name)
+        if one.name not in packed and one.name in _ADDED:
+            arrays.append(np.full(count, _ADDED[one.name]).astype(empty.dtype))
+            continue
         flat = np.frombuffer(packed[one.name], dtype=empty.dtype.newbyteorder("<")).astype(empty.dtype)
         arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import Picture, advance
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
@@ -53,6 +54,7 @@ def picture_message(
     intake: Intake,
     journal: Journal,
     contributions: Contributions,
+    labels: Labels,
     *,
     epoch: int,
     seq: int,
@@ -63,12 +65,13 @@ def picture_message(
     """The message that publishes a picture; its lineage is every source known and the centre itself."""
     config, names = intake.config, intake.names()
     origins = {source.origin for source in intake.sources.values() if source.messages}
+    origin = max(origins, key=ORIGINS.index, default="live")
     return GlobalTracks(
         source=config.name,
         epoch=epoch,
         seq=seq,
         sent=time,
-        origin=max(origins, key=ORIGINS.index, default="live"),
+        origin=origin,
         lineage=(*(name for name in names if name != config.name), config.name),
         time=time,
         step=step,
@@ -88,6 +91,7 @@ def picture_message(
         contributor_influence=contributions.influence,
         ended=journal.ended(),
         split_from=journal.splits(),
+        **labels.columns(picture.id, origin),
     )
 
 

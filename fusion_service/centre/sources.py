@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, linalg
+from fusion_service.centre.words import Codes, Lexicon
 from fusion_service.densities import Mixtures, reduce_mixtures
-from schemas import Frame, Height, LocalTracks, SensorInfo
+from schemas import ORIGINS, Frame, Height, LocalTracks, SensorInfo
 
 __all__ = [
     "REMEMBERED",
@@ -66,7 +67,9 @@ class Tracks:
     part_mean (n, C, T), part_covariance (n, n, C, T), and mean and covariance are their moments; else C = 0.
     id u64; time i64 of the density; updated i64 of the last measurement; existence (NaN: not reported);
     link u64 global id or 0; since i64 step of the link; fails i64 steps in a row that the link has failed;
-    used i64 time of the version last fused (-1: none).
+    used i64 time of the version last fused (-1: none). identity, kind i32 codes of what it is said to be (-1: not
+    said), kind_p (NaN: not said); origin u8 index into `ORIGINS` of the message; told i64 `updated` of the version
+    whose identity and class the global track has heard (-1: none).
     """
 
     id: NDArray[np.uint64]
@@ -82,6 +85,11 @@ class Tracks:
     since: NDArray[np.int64]
     fails: NDArray[np.int64]
     used: NDArray[np.int64]
+    identity: Codes
+    kind: Codes
+    kind_p: NDArray[np.float64]
+    origin: NDArray[np.uint8]
+    told: NDArray[np.int64]
 
     def take(self, rows: Any) -> Tracks:
         """The given rows (indices or a mask)."""
@@ -92,15 +100,34 @@ class Tracks:
         return as_mixtures(self, rows)
 
 
-LINKS = ("link", "since", "fails", "used")
+LINKS = ("link", "since", "fails", "used", "told")
 
 
 def empty_tracks(n: int) -> Tracks:
     """No tracks, of n components."""
-    whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
-    ids = np.zeros(0, dtype=np.uint64)
-    moments, parts = (np.zeros((n, 0)), np.zeros((n, n, 0))), no_parts(n, 0)
-    return Tracks(ids, whole, *moments, *parts, real, whole, ids, whole, whole, whole)
+    whole, real, code = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int32)
+    ids, origin = np.zeros(0, dtype=np.uint64), np.zeros(0, dtype=np.uint8)
+    log_weight, part_mean, part_covariance = no_parts(n, 0)
+    return Tracks(
+        id=ids,
+        time=whole,
+        mean=np.zeros((n, 0)),
+        covariance=np.zeros((n, n, 0)),
+        log_weight=log_weight,
+        part_mean=part_mean,
+        part_covariance=part_covariance,
+        existence=real,
+        updated=whole,
+        link=ids,
+        since=whole,
+        fails=whole,
+        used=whole,
+        identity=code,
+        kind=code,
+        kind_p=real,
+        origin=origin,
+        told=whole,
+    )
 
 
 def no_parts(n: int, count: int) -> tuple[Floats, Floats, Floats]:
@@ -144,10 +171,15 @@ def padded(tracks: Columns, components: int) -> Columns:
 
 
 def message_tracks(
-    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], frame: Frame, height: Height | None, most: int
+    messages: Sequence[LocalTracks],
+    sound: Sequence[NDArray[np.bool_]],
+    frame: Frame,
+    height: Height | None,
+    most: int,
+    said: Lexicon,
 ) -> Tracks:
     """The sound tracks of messages of one space, frame and height, in `frame`, one after the other; mixtures of
-    more than `most` components are reduced.
+    more than `most` components are reduced. said: gives texts their codes.
 
     Raises `geodesy.FrameError` where their frame cannot be brought into `frame`.
     """
@@ -184,7 +216,28 @@ def message_tracks(
         since=none,
         fails=np.zeros(len(times), dtype=np.int64),
         used=none,
+        **_told(messages, sound, counts, said),
+        told=none,
     )
+
+
+def _told(
+    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], counts: list[int], said: Lexicon
+) -> dict[str, NDArray[Any]]:
+    """The columns of what the tracks are said to be, and of their origin."""
+    nothing = [np.full(len(m.ids), -1, dtype=np.int32) for m in messages]
+    identity, kind = (
+        [none if texts is None else words.codes(texts) for texts, none in zip(column, nothing, strict=True)]
+        for words, column in ((said.identity, [m.identity for m in messages]), (said.kind, [m.kind for m in messages]))
+    )
+    sure = [np.full(len(m.ids), np.nan) if m.kind_p is None else m.kind_p for m in messages]
+    origins = np.array([ORIGINS.index(m.origin) for m in messages], dtype=np.uint8)
+    return {
+        "identity": _gather(identity, sound),
+        "kind": _gather(kind, sound),
+        "kind_p": _gather(sure, sound).astype(np.float64),
+        "origin": np.repeat(origins, counts),
+    }
 
 
 def _components(message: LocalTracks, sound: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, NDArray[np.intp]]:
@@ -202,13 +255,14 @@ def _gather(columns: Sequence[NDArray[Any]], rows: Sequence[NDArray[np.bool_]]) 
 
 
 def newest(old: Tracks, new: Tracks) -> Tracks:
-    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept.
+    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept unless the
+    origin has changed.
 
     `old` is sorted by id; `new` may hold an id several times.
     """
     if len(old.id) and len(new.id):
         at = np.minimum(np.searchsorted(old.id, new.id), len(old.id) - 1)
-        known = old.id[at] == new.id
+        known = (old.id[at] == new.id) & (old.origin[at] == new.origin)
         kept = {name: np.where(known, getattr(old, name)[at], getattr(new, name)) for name in LINKS}
         new = replace(new, **kept)
     both = join_tracks([old, new])

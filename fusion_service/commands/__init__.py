@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from fusion_service.commands import evaluate, explain, export, repair, replay
+from fusion_service.commands import evaluate, explain, export, order, repair, replay
 
 __all__ = ["COMMANDS"]
 
-COMMANDS: tuple[ModuleType, ...] = (replay, evaluate, explain, export, repair)
+COMMANDS: tuple[ModuleType, ...] = (order, replay, evaluate, explain, export, repair)
 """In the order of the help; a command is called as its module, with hyphens."""

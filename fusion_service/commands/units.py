@@ -1,11 +1,12 @@
-"""Sizes and durations as people write them: 500MB, 20 GB, 90s, 1h, 7d."""
+"""Sizes, durations and moments as people write them: 500MB, 20 GB, 90s, 1h, 7d, 2026-01-31T12:00:00Z."""
 
 from __future__ import annotations
 
 import math
 import re
+from datetime import UTC, datetime
 
-__all__ = ["duration", "size"]
+__all__ = ["duration", "moment", "size"]
 
 SIZES = {"b": 1, "": 1} | {
     f"{prefix}{suffix}": base**power
@@ -25,6 +26,19 @@ def size(text: str) -> int:
 def duration(text: str) -> float:
     """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. `ValueError` in one line."""
     return _value(text, SECONDS, "a duration: give a number and s, min, h, d or w, as in 1h")
+
+
+def moment(text: str) -> tuple[str, float]:
+    """A duration from now, ("for", seconds), or a time, ("until", ns UTC), in ISO 8601. `ValueError` in one line."""
+    try:
+        return "for", duration(text)
+    except ValueError:
+        pass
+    try:
+        when = datetime.fromisoformat(text.strip())
+    except ValueError:
+        raise ValueError(f"{text!r} is not a time: give a duration, as in 10min, or 2026-01-31T12:00:00Z") from None
+    return "until", round(when.replace(tzinfo=when.tzinfo or UTC).timestamp()) * 10**9
 
 
 def _value(text: str, units: dict[str, float] | dict[str, int], what: str) -> float:

@@ -20,7 +20,7 @@ import numpy as np
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.config.toml_text import dotted, key_lines, line_of, toml_value
-from schemas import Ecef, Enu, Frame, Height, Local, Motion, check_name, check_realm, check_space
+from schemas import ORIGINS, Ecef, Enu, Frame, Height, Local, Motion, check_name, check_realm, check_space
 
 __all__ = [
     "BusConfig",
@@ -162,6 +162,13 @@ def _endpoints(value: Any) -> tuple[str, ...]:
     return tuple(check_endpoint(text) for text in texts)
 
 
+def _origins(value: Any) -> tuple[str, ...]:
+    texts = _texts(value)
+    if not texts or not set(texts) <= set(ORIGINS):
+        raise ValueError(f"must be a list of some of: {', '.join(ORIGINS)}")
+    return texts
+
+
 def _maybe(read: Callable[[Any], T]) -> Callable[[Any], T | None]:
     return lambda value: None if value is None else read(value)
 
@@ -180,6 +187,9 @@ class SourceConfig:
     height: Height = _setting(Height(), lambda v: _build(Height, v), "height of what a 2-D source sees, m")
     override: bool = _setting(False, _flag, "use these values even where its SensorInfo says otherwise")
     ignore: bool = _setting(False, _flag, "refuse all it sends (reason: muted)")
+    allowed_origins: tuple[str, ...] = _setting(ORIGINS, _origins, "origins taken from it; others are refused")
+    identity_trust: float = _setting(0.99, _number(0.5, 1 - 1e-9), "probability that an identity it says is right")
+    kind_accuracy: float = _setting(0.8, _number(0, 1 - 1e-9), "probability that a class it says is right")
 
 
 @dataclass(frozen=True)
@@ -221,6 +231,7 @@ class CentreConfig:
         0.0, _number(0, 1), "a track of less existence is tentative, or ends without support"
     )
     coast: float = _setting(5.0, _DURATION, "seconds a confirmed track lives on without support")
+    fuse_origins: bool = _setting(False, _flag, "fuse live, exercise, simulated and replayed tracks with each other")
     stale_periods: float = _setting(3.0, _number(1, 1e6), "a source (or track) is stale after so many periods")
     intensity_rule: str = _setting(
         "hybrid",

@@ -17,8 +17,6 @@ import time
 from collections import Counter
 from typing import Any, NamedTuple
 
-import msgpack
-
 from fusion_service.bus import Bus, Inbox, open_bus
 from fusion_service.centre import (
     Centre,
@@ -32,13 +30,13 @@ from fusion_service.centre import (
     make_centre,
 )
 from fusion_service.config import ServiceConfig
+from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError, open_state
 from schemas import (
     LocalIntensity,
     LocalTracks,
     MessageError,
     Status,
-    check_name,
     decode,
     encode,
     global_key,
@@ -84,7 +82,8 @@ class Service:
         self._tokens: dict[str, bool] = {}
         self._lock = threading.Lock()
         self._seen_tokens: dict[str, bool] = {}
-        self._muted: dict[str, Order] = {}
+        self._desk = OrderDesk(lambda order: self._inbox.put("", order))
+        self._desk.follow(self._centre)
         self._dropped: Counter[str] = Counter()
         self._said: Counter[str] = Counter()
         self._quiet: dict[str, tuple[float, int]] = {}
@@ -116,7 +115,7 @@ class Service:
         for what in ("info", "tracks", "intensity"):
             bus.subscribe(local_key("*", what, realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
-        bus.answer(global_key(name, "orders", realm), self._on_order)
+        bus.answer(global_key(name, "orders", realm), self._desk.answer)
         bus.announce(global_key(name, "alive", realm))
         threading.Thread(target=self._wake_at, args=(stop,), daemon=True).start()
         _notify("READY=1")
@@ -177,29 +176,18 @@ class Service:
             raise ValueError("no step has been made yet")
         return self._picture
 
-    def _on_order(self, payload: bytes | None) -> bytes:
-        raw = msgpack.unpackb(payload or b"\x80")
-        if not isinstance(raw, dict) or raw.get("what") not in ("mute", "unmute", "delete"):
-            raise ValueError('an order is a map: {"what": "mute" | "unmute" | "delete", "source" or "track": ...}')
-        source, track = raw.get("source", ""), raw.get("track")
-        if raw["what"] == "delete" and not (type(track) is int and 0 < track < 2**64):
-            raise ValueError('the order delete needs the global id: {"what": "delete", "track": id}')
-        if raw["what"] != "delete":
-            if not isinstance(source, str):
-                raise ValueError('the orders mute and unmute need a name: {"what": "mute", "source": name}')
-            check_name(source)
-        self._inbox.put("", Order(raw["what"], source, track))
-        return b"\xc3"
-
     # The loop
 
     def _receive(self, item: Arrival | Order) -> None:
         if isinstance(item, Order):
-            log.info("order: %s %s%s", item.what, item.source, item.track or "")
-            if item.what == "mute" and len(self._muted) < MAX_NAMES:
-                self._muted[item.source] = item
-            elif item.what == "unmute":
-                self._muted.pop(item.source, None)
+            log.info(
+                "order %d of %s: %s%s",
+                item.number,
+                item.who or "?",
+                item.what,
+                f": {item.refused}" * bool(item.refused),
+            )
+            self._desk.given(item)
             self._centre.handle(item, time.time_ns())
             return
         self._counts["messages"] += 1
@@ -294,6 +282,7 @@ class Service:
             result, data = again
         self._save()
         self._result = result
+        self._desk.follow(self._centre)
         seconds = time.perf_counter() - begin
         self._counts["steps"] += 1
         self._step_seconds["last"] = seconds
@@ -336,7 +325,7 @@ class Service:
             self._loudly("cannot write an id generation: %s", error)
         self._centre = self._make_centre(self._generation)
         self._seen_tokens = {}
-        for order in self._muted.values():
+        for order in self._desk.again(self._blob is None):
             self._centre.handle(order, time.time_ns())
 
     def _save(self) -> None:

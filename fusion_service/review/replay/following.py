@@ -20,12 +20,12 @@ from fusion_service.centre import (
     Centre,
     Event,
     MessageClock,
-    Order,
     Refused,
     SourceFound,
     SourceLost,
     StepResult,
     make_centre,
+    order_of,
 )
 from fusion_service.config import CentreConfig, config_hash
 from fusion_service.recording.steps import PATIENCE, Step, Steps
@@ -258,9 +258,8 @@ def _events(log: StepLog) -> list[Event]:
         kind, source = event.get("kind"), event.get("source")
         if kind in ("found", "lost") and isinstance(source, str):
             events.append((SourceFound if kind == "found" else SourceLost)(source))
-        elif kind == "order" and isinstance(event.get("what"), str) and isinstance(source, str):
-            track = event.get("track")
-            events.append(Order(event["what"], source, track if isinstance(track, int) else None))
+        elif (order := order_of(event)) is not None:
+            events.append(order)
     return events
 
 
