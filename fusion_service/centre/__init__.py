@@ -8,7 +8,7 @@ from fusion_service.centre.intake import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.intensity import IntensityCentre
 from fusion_service.centre.judging import Outcome, View, judge
 from fusion_service.centre.making import make_centre
-from fusion_service.centre.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
+from fusion_service.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
 
 __all__ = [
     "NEEDED",

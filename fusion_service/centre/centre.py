@@ -25,12 +25,12 @@ from fusion_service.centre.judging import View
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import empty_picture
 from fusion_service.centre.obeying import heirs, obey, view_of
-from fusion_service.centre.order import Order
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.publishing import Contributions, picture_message
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.status import step_status
 from fusion_service.config import CentreConfig, centre_config, config_hash
+from fusion_service.order import Order
 from schemas import GlobalTracks, Status, StepLog, messages
 
 __all__ = ["Centre", "StepResult"]

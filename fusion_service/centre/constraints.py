@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre.order import LocalId
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.order import LocalId
 
 __all__ = ["Constraints", "constraints", "find_rows"]
 

@@ -107,6 +107,10 @@ class Identities:
             source.tracks = replace(source.tracks, told=rows.tracks.told[start : start + count])
             start += count
 
+    def schemes(self) -> Codes:
+        """The scheme of each identity, by code."""
+        return self._intake.said.identity.schemes()
+
     def _classes(self) -> int:
         return int(np.clip(len(self._intake.said.kind.texts), 2, MOST_CLASSES))
 

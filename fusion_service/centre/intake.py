@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.clock import horizon
 from fusion_service.centre.journal import Journal
-from fusion_service.centre.order import Order
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.sources import Source, Tracks, empty_tracks, message_tracks
 from fusion_service.centre.words import Lexicon, Words
 from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.geodesy import FrameError
+from fusion_service.order import Order
 from schemas import (
     FAULTS,
     Entry,

@@ -13,8 +13,8 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre.order import WHAT, LocalId, Order
 from fusion_service.centre.sources import Tracks
+from fusion_service.order import WHAT, LocalId, Order
 from schemas import check_name
 
 __all__ = ["MOST_STANDING", "Outcome", "Seen", "Standing", "View", "find_local", "judge", "linked_to", "lives"]

@@ -13,8 +13,8 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.judging import View, find_local, judge, linked_to
 from fusion_service.centre.lifecycle import Picture, newborn
-from fusion_service.centre.order import LocalId, Order, order_event
 from fusion_service.centre.rows import NO_TRACK
+from fusion_service.order import LocalId, Order, order_event
 
 __all__ = ["Obeyed", "heirs", "obey", "view_of"]
 

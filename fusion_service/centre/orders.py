@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service.centre.judging import Standing, View, lives
-from fusion_service.centre.order import LocalId, Order, order_event, order_of
+from fusion_service.order import LocalId, Order, order_event, order_of
 
 __all__ = ["Orders"]
 

@@ -24,8 +24,8 @@ ANSWER = 5.0
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
-    from fusion_service.centre.order import WHAT
     from fusion_service.commands import units
+    from fusion_service.order import WHAT
 
     def until(text: str) -> tuple[str, float]:
         try:
@@ -124,7 +124,7 @@ def _request(args: argparse.Namespace) -> dict[str, Any]:
 
 def _missing(request: dict[str, Any]) -> str:
     """What an order needs and was not given, in the words of the command line; empty if nothing."""
-    from fusion_service.centre.order import NEEDED
+    from fusion_service.order import NEEDED
 
     options = {
         "track": "--track",
