@@ -11,8 +11,20 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple
 
-__all__ = ["MOST_TEXT", "NEEDED", "WHAT", "LocalId", "Order", "order_event", "order_of", "read_order"]
+__all__ = [
+    "ABOUT",
+    "MOST_NUMBER",
+    "MOST_TEXT",
+    "NEEDED",
+    "WHAT",
+    "LocalId",
+    "Order",
+    "order_event",
+    "order_of",
+    "read_order",
+]
 
+MOST_NUMBER = 2**62
 MOST_TEXT = 200
 """Characters of a text in an order."""
 WHAT = {
@@ -58,6 +70,18 @@ class LocalId(NamedTuple):
         return f"{self.source} {self.id}"
 
 
+_PAIR = ("track", "local")
+ABOUT = {
+    **dict.fromkeys(("link", "unlink", "split"), _PAIR),
+    "never-link": (*_PAIR, "against"),
+    "rename": ("track", "name", "shown"),
+    "identify": ("track", "identity"),
+    "delete": (),
+    **dict.fromkeys(("mute", "quarantine"), ("source",)),
+}
+"""The orders that stand, and what of an order does (with who, why, until and number)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Order:
     """An operator's order, one of `WHAT`.
@@ -84,6 +108,11 @@ class Order:
     withdrawn: int = 0
     number: int = 0
     refused: str = ""
+
+    def stripped(self) -> Order:
+        """Without what an order of this kind is not about, as it stands."""
+        about = {name: getattr(self, name) for name in (*ABOUT[self.what], "who", "why", "until", "number")}
+        return Order(self.what, **about)
 
 
 _DEFAULTS = {one.name: one.default for one in fields(Order) if one.name not in ("what", "source", "track")}
@@ -155,6 +184,7 @@ _READERS: dict[str, Any] = {
     **dict.fromkeys(("what", "source", "who", "why", "name", "identity", "refused"), _text),
     **dict.fromkeys(("track", "other"), _U64),
     **dict.fromkeys(("local", "against"), _local),
-    **dict.fromkeys(("until", "withdrawn", "number"), _whole(2**63)),
+    **dict.fromkeys(("until", "withdrawn"), _whole(2**63)),
+    "number": _whole(MOST_NUMBER),
     "shown": _whole(2**32),
 }

@@ -17,11 +17,13 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.words import NONE, Codes
 
-__all__ = ["CANDIDATES", "DEPTH", "Beliefs", "learned", "no_beliefs"]
+__all__ = ["CANDIDATES", "DEPTH", "OPEN", "Beliefs", "learned", "no_beliefs"]
 
 Floats = NDArray[np.float64]
 Ids = NDArray[np.uint64]
 CANDIDATES = 4
+OPEN = 0
+"""Answers without end: all those that are no candidates weigh as one."""
 DEPTH = float(np.log(1e4))
 
 
@@ -52,9 +54,9 @@ class Beliefs:
         return found
 
     def probabilities(self, answers: int) -> Floats:
-        """(CANDIDATES, R): probability of each candidate, where so many answers are possible."""
+        """(CANDIDATES, R): probability of each candidate, where so many answers are possible, or `OPEN`."""
         odds = np.exp(self.weight)
-        others = np.maximum(answers - (self.code != NONE).sum(axis=0), 1)
+        others = np.maximum(answers - (self.code != NONE).sum(axis=0), 0) if answers != OPEN else 1
         total = odds[-1] * others
         for one in odds[:-1]:
             total = total + one

@@ -15,6 +15,7 @@ from fusion_service.centre.existence import existence_now
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.linking import Linker
+from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import Rows
 from fusion_service.config import CentreConfig
@@ -44,7 +45,7 @@ class FusionCentre(Centre):
         self._linker.agreeing = state["agreeing"]
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
-        self._associate(rows, time)
+        self._associate(rows, names, time)
         self._picture, influence = fuse_all(rows, self._predicted(time), time, self.config, self._journal)
         self._live(rows, time)
         write_back(rows, self._intake)
@@ -64,11 +65,13 @@ class FusionCentre(Centre):
             at = np.minimum(np.searchsorted(old, link), len(old) - 1)
             source.tracks = replace(source.tracks, link=np.where(old[at] == link, to[at], link))
 
-    def _associate(self, rows: Rows, time: int) -> None:
+    def _associate(self, rows: Rows, names: tuple[str, ...], time: int) -> None:
         linker, journal = self._linker, self._journal
+        meeting = Meeting(self._intake, self._labels, rows, self._picture.id, names)
+        rows.tracks.link[meeting.forced_row] = meeting.forced_track
         linker.check(rows, journal)
         now = self._predicted(time)
-        self._picture, agreements = linker.link(rows, self._picture, now, self._step, time, journal)
+        self._picture, agreements = linker.link(rows, self._picture, now, meeting, self._step, time, journal)
         merged = linker.merge(rows, agreements, self._step, journal)
         self._relink(merged)
         if merged:

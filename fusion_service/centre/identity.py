@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre.beliefs import Beliefs, learned, no_beliefs
+from fusion_service.centre.beliefs import OPEN, Beliefs, learned, no_beliefs
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.words import NONE, Codes
@@ -122,7 +122,7 @@ class Identities:
 
     def named(self, ids: Ids) -> tuple[Codes, Floats]:
         """Identity (code, -1: none) and its probability (G,) of each of these tracks: of its schemes the surest."""
-        code, p = _of_tracks(self.identity, ids, 2)
+        code, p = _of_tracks(self.identity, ids, OPEN)
         for track, text in self.ordered().items():
             at = np.flatnonzero(ids == np.uint64(track))
             code[at], p[at] = self._intake.said.identity.code(text), 1.0
@@ -139,11 +139,11 @@ class Identities:
         said = np.flatnonzero(code != NONE)
         if not len(said) or not len(self.identity.track):
             return Terms(ratio, forbidden)
-        schemes, best = self._intake.said.identity.schemes(), self.identity.best(2)
+        schemes, best = self._intake.said.identity.schemes(), self.identity.best(OPEN)
         at = self.identity.find(track[said], schemes[code[said]])
         said, at = said[at >= 0], at[at >= 0]
         trust = self._stated("identity_trust", rows.source[row[said]])
-        p = np.where(self.identity.code[:, at] == code[said], self.identity.probabilities(2)[:, at], 0.0).max(axis=0)
+        p = np.where(self.identity.code[:, at] == code[said], self.identity.probabilities(OPEN)[:, at], 0.0).max(axis=0)
         ratio[said] = np.log(POPULATION * trust * p + (1.0 - trust) * (1.0 - p))
         other = (best[0][at] != code[said]) & (best[1][at] >= TRUSTED)
         forbidden[said] = other & (trust >= TRUSTED)

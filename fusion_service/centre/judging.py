@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.centre.sources import Tracks
-from fusion_service.order import WHAT, LocalId, Order
+from fusion_service.order import ABOUT, WHAT, LocalId, Order
 from schemas import check_name
 
 __all__ = ["MOST_STANDING", "Outcome", "Seen", "Standing", "View", "find_local", "judge", "linked_to", "lives"]
@@ -22,7 +22,6 @@ __all__ = ["MOST_STANDING", "Outcome", "Seen", "Standing", "View", "find_local",
 MOST_STANDING = 10_000
 MOST_LISTED = 8
 """Names told in the reason of a refusal."""
-_STANDS = ("delete", "link", "unlink", "never-link", "split", "rename", "identify", "mute", "quarantine")
 
 
 class Outcome(NamedTuple):
@@ -75,7 +74,7 @@ def judge(order: Order, view: View) -> Outcome:
             raise _No(f"there is no order {order.what!r}: known are {', '.join(WHAT)}")
         if order.until is not None and order.until <= view.time:
             raise _No("it would stand until a time that has passed")
-        if order.what in _STANDS and len(view.standing) >= MOST_STANDING:
+        if order.what in ABOUT and len(view.standing) >= MOST_STANDING:
             raise _No(f"{MOST_STANDING} orders stand already: withdraw some")
         return Outcome(True, _CHECKS[order.what](order, view))
     except _No as error:

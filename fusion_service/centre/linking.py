@@ -20,6 +20,7 @@ from fusion_service.centre.association import (
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture, newborn
+from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
@@ -74,7 +75,7 @@ class Linker:
         journal.decide(messages.KEPT, rows, linked[stays], links[stays], distance[stays])
 
     def link(
-        self, rows: Rows, picture: Picture, now: Picture, step: int, time: int, journal: Journal
+        self, rows: Rows, picture: Picture, now: Picture, meeting: Meeting, step: int, time: int, journal: Journal
     ) -> tuple[Picture, list[Agreement]]:
         """Link free tracks to global tracks or to each other, and start new ones.
 
@@ -83,7 +84,7 @@ class Linker:
         source.
         """
         mean, covariance, masks, bits = self._nodes(rows, picture, now.mean, now.covariance)
-        free = np.flatnonzero(rows.tracks.link == NO_TRACK)
+        free = np.flatnonzero((rows.tracks.link == NO_TRACK) & ~meeting.held)
         known = np.flatnonzero(picture.time >= 0)
         count = len(known)
         mean = np.concatenate([mean[:, known], rows.tracks.mean[:, free]], axis=1)
@@ -92,6 +93,7 @@ class Linker:
         source = np.concatenate([np.full(count, -1), rows.source[free]])
         parts = _components(now, known, rows, free)
         i, j, distance, spread = self._gated(mean, covariance, masks, source, parts)
+        i, j, distance, spread = _meeting(meeting, i, j, distance, spread, known, free)
         both = j < count
         agreements = [
             (int(picture.id[known[a]]), int(picture.id[known[b]]), float(d))
@@ -196,6 +198,22 @@ class Linker:
                 rows.tracks.since[moved] = step
         self.agreeing = {pair: count for pair, count in self.agreeing.items() if not taken & set(pair)}
         return merged
+
+
+def _meeting(
+    meeting: Meeting, i: Ints, j: Ints, distance: Floats, spread: Floats, known: Ints, free: Ints
+) -> tuple[Ints, Ints, Floats, Floats]:
+    """The pairs that may meet, ranked by what they are said to be too."""
+    count, forbidden, spread = len(known), np.zeros(len(i), dtype=np.bool_), spread.copy()
+    pairs, mixed, ours = i >= count, (i < count) & (j >= count), j < count
+    for mask, terms in (
+        (pairs, meeting.with_rows(free[i[pairs] - count], free[j[pairs] - count])),
+        (mixed, meeting.with_tracks(free[j[mixed] - count], known[i[mixed]])),
+    ):
+        spread[mask] -= 2.0 * terms.ratio
+        forbidden[mask] = terms.forbidden
+    forbidden[ours] = meeting.of_tracks(known[i[ours]], known[j[ours]])
+    return i[~forbidden], j[~forbidden], distance[~forbidden], spread[~forbidden]
 
 
 def _components(now: Picture, known: Ints, rows: Rows, free: Ints) -> Mixtures | None:

@@ -52,7 +52,7 @@ class Meeting:
 
     def of_tracks(self, a: Ints, b: Ints) -> Mask:
         """Of P pairs of global tracks (places in `ids`), those never to be merged."""
-        forbidden = self._of_tracks[a] != self._of_tracks[b]
+        forbidden: Mask = self._of_tracks[a] != self._of_tracks[b]
         code, p = self._identities.named(self._ids)
         both = (code[a] != NONE) & (code[b] != NONE) & (p[a] >= TRUSTED) & (p[b] >= TRUSTED)
         if both.any():

@@ -81,6 +81,7 @@ class _Hands:
         self.picture = self.picture.take(self.picture.id != np.uint64(track))
 
     def _stand(self, order: Order, held: tuple[LocalId, ...] = ()) -> None:
+        order = order.stripped()
         local = order.local and self._local(order.local)
         against = order.against and self._local(order.against)
         self.intake.orders.stand(replace(order, local=local, against=against), held)
@@ -92,7 +93,7 @@ class _Hands:
         self._relink(track, int(NO_TRACK))
         self._end(track, 0)
         if held:
-            self._stand(replace(order, track=None), held)
+            self._stand(order, held)
 
     def _link(self, order: Order) -> None:
         local = self._local(order.local)

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service.centre.judging import Standing, View, lives
-from fusion_service.order import LocalId, Order, order_event, order_of
+from fusion_service.order import MOST_NUMBER, LocalId, Order, order_event, order_of
 
 __all__ = ["Orders"]
 
@@ -27,7 +27,7 @@ class Orders:
 
     def numbered(self, order: Order) -> Order:
         """The order with its number: its own where that is new, else the next."""
-        number = max(order.number, self.next)
+        number = max(order.number if order.number < MOST_NUMBER else 0, self.next)
         self.next = number + 1
         return replace(order, number=number)
 
