@@ -17,7 +17,7 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from schemas.messages import CONFIRMED
 
-__all__ = ["FAR", "HOLD", "NEAR", "Twice"]
+__all__ = ["FAR", "HOLD", "MOST", "NEAR", "Twice"]
 
 FAR, NEAR = 50.0, 25.0
 HOLD = 10.0

@@ -381,7 +381,7 @@ def _fits(message: _Scan) -> bool:
         and message.covariances.shape == (total, n, n)
         and all(column is None or len(column) == tracks for column in lengths)
         and (message.weights is None or len(message.weights) == total)
-        and all(text is None or type(text) is str for text in texts)
+        and {*map(type, texts)} <= {str, type(None)}
     )
 
 
