@@ -13,7 +13,6 @@ share of true places inside the region of the mixture's highest density that hol
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import densities
+from fusion_service.process import data_folder
 from sensor_clients.playback import autoferry
 from sensor_clients.playback.cameras import CameraSensor
 
@@ -119,14 +119,15 @@ def score(directory: Path, number: int, sensor: CameraSensor) -> Score:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("FUSION_DATA"), help="default: $FUSION_DATA")
+    parser.add_argument("--data", help="the Autoferry files, or what holds autoferry/ (default: $FUSION_DATA)")
     arguments = parser.parse_args()
-    if not arguments.data:
+    directory = data_folder("autoferry", arguments.data)
+    if directory is None:
         parser.error("say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")
     print(f"{'':9}" + "".join(f"{name:>9}" for name in Score._fields))
     for name, sensor in autoferry.SENSORS.items():
         if isinstance(sensor, CameraSensor):
-            rows = [score(Path(arguments.data), number, sensor) for number in SCENARIOS]
+            rows = [score(directory, number, sensor) for number in SCENARIOS]
             for label, row in zip((*map(str, SCENARIOS), "mean"), [*rows, np.nanmean(rows, axis=0)], strict=True):
                 print(f"{name:3}{label:>6}" + "".join(f"{value:9.3f}" for value in row))
     return 0

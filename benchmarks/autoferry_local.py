@@ -11,7 +11,6 @@ setting that only fits these five scenes by luck would fall apart.
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Iterable
 from dataclasses import fields, replace
@@ -20,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from fusion_service.process import data_folder
 from fusion_service.review.evaluation import METRICS, evaluate
 from schemas import LocalTracks, Message, Motion, SensorInfo, Truth
 from sensor_clients.events import Event
@@ -89,12 +89,12 @@ def mean_scores(directory: Path, sensors: dict[str, HarbourSensor], show: bool) 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=os.environ.get("FUSION_DATA"), help="default: $FUSION_DATA")
+    parser.add_argument("--data", help="the Autoferry files, or what holds autoferry/ (default: $FUSION_DATA)")
     parser.add_argument("--perturb", type=int, default=0, metavar="K", help="also score K changed settings")
     arguments = parser.parse_args()
-    if not arguments.data:
+    directory = data_folder("autoferry", arguments.data)
+    if directory is None:
         parser.error("say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")
-    directory = Path(arguments.data)
     mean_scores(directory, {"lidar": LIDAR, "radar": RADAR}, show=True)
     rng = np.random.default_rng(0)
     trials = []

@@ -78,8 +78,8 @@ def mission(seconds: int, targets: int, seed: int = 1) -> Iterator[tuple[str, Me
                 covariances=np.tile(P, (len(seen), 1, 1)), **head, **where,
             )  # fmt: skip
         noise = rng.standard_normal((targets, 4)) * np.sqrt(np.diag(P / 3))
-        owner, source = np.nonzero(saw.T)
-        source = source.astype(np.uint16)
+        owner, index = np.nonzero(saw.T)
+        source = index.astype(np.uint16)
         epochs = np.ones(len(owner), dtype=np.uint64)
         yield global_key("centre", "tracks"), GlobalTracks(
             source="centre", step=k, rule="ci", ids=ids, status=np.ones(targets, dtype=np.uint8),

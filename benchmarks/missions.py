@@ -38,7 +38,7 @@ def cells(name: str, one: dict[str, float]) -> str:
 
 def three_radars(speed: float) -> None:
     print("| | GOSPA, m | localisation, m2 | missed, m2 | false, m2 | RMSE, m | ANEES |\n|---|---|---|---|---|---|---|")
-    shared = []
+    shared: list[tuple[str, dict[str, Any]]] = []
     for rule, criterion in RULES:
         options = ["--rule", rule, *(["--criterion", criterion] if criterion else [])]
         result = demo(*options, speed=speed)

@@ -188,17 +188,18 @@ def run(sources: int, tracks: int, seconds: float, *, record: bool, draw: bool =
         feed.start()
         time.sleep(5.0)
         latencies.clear()
-        begin, before = time.monotonic(), (usage(service.pid), recorder and usage(recorder.pid))
+        begin, before = time.monotonic(), (usage(service.pid), usage(recorder.pid) if recorder else None)
         time.sleep(seconds / 3)
         early = usage(recorder.pid).resident if recorder else 0.0
         time.sleep(2 * seconds / 3)
         spent = time.monotonic() - begin
-        after = (usage(service.pid), recorder and usage(recorder.pid))
+        after = (usage(service.pid), usage(recorder.pid) if recorder else None)
         feed.stop.set()
         feed.join()
         shares = [(b.seconds - a.seconds) / spent if a and b else 0.0 for a, b in zip(before, after, strict=True)]
         steps = status[-1].step_time
-        resident = after[1].resident if after[1] else 0.0
+        end = after[1]
+        resident = end.resident if end is not None else 0.0
         size = path.stat().st_size if record else 0
         low, high = np.quantile(latencies, [0.5, 0.99]).tolist()
         return Heard(

@@ -8,13 +8,20 @@ by its logs, fused again under five rules, and all of them compared on one page.
 from __future__ import annotations
 
 import argparse
-import signal
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-from fusion_service import demo
+from fusion_service.demo import (
+    START,
+    Crew,
+    client_arguments,
+    free_endpoint,
+    plan_mission,
+    record_arguments,
+    write_config,
+)
 
 RULES = ("naive", "ci", "bci:max_correlation=0.5", "ici", "hmd-ga")
 KILLS = ((100.0, "service"), (150.0, "radar2"), (200.0, "record"))
@@ -23,33 +30,29 @@ KILLS = ((100.0, "service"), (150.0, "radar2"), (200.0, "record"))
 
 def fly(folder: Path, speed: float) -> Path:
     """Fly the mission; returns the recording, a folder."""
-    mission = demo._mission("three-radars", None, 1, "ckf", False)
-    endpoint = f"tcp/127.0.0.1:{demo._free_port()}"
-    settings = {"clock": "message", "rule": "ci", **mission.settings(speed)}
-    tables = {"centre": settings, "bus": {"connect": [endpoint]}, "service": {"state": str(folder / "state")}}
-    config, recording = folder / "centre.toml", folder / "mission"
-    config.write_text("".join(map(demo._toml_table, tables, tables.values())), encoding="utf-8")
-    with demo.Crew(folder) as crew:
+    plan = plan_mission("three-radars")
+    endpoint = free_endpoint()
+    config = write_config(folder, {"clock": "message", "rule": "ci", **plan.settings(speed)}, endpoint)
+    recording = folder / "mission"
+    with Crew(folder) as crew:
         commands = {
             "hub": ["fusion_service", "hub", "--listen", endpoint],
             "service": ["fusion_service", "run", "--config", str(config)],
-            "record": ["fusion_service", "record", "--out", f"{recording}/", "--connect", endpoint, "--cutoff", "5000"],
+            "record": record_arguments(f"{recording}/", endpoint, plan.cutoff),
         }
         for name in ("hub", "record", "service"):
             crew.start(name, commands[name])
             time.sleep(3.0)
-        begin = time.time() + demo.START
-        for name, command in mission.clients.items():
-            timing = ["--connect", endpoint, "--speed", str(speed), "--start-at", f"{begin:.3f}"]
-            commands[name] = ["sensor_clients", *command, *timing]
+        begin = time.time() + START
+        for name, command in plan.clients.items():
+            commands[name] = client_arguments(command, endpoint, speed, begin)
             crew.start(name, commands[name])
         for at, name in KILLS:
             time.sleep(max(0.0, begin + at / speed - time.time()))
-            crew._processes[name].send_signal(signal.SIGKILL)
-            crew._processes[name].wait()
+            crew.kill(name)
             crew.start(name, commands[name])
             print(f"{at:5.0f} s  {name} killed and started again", flush=True)
-        while crew.running(*mission.clients):
+        while crew.running(*plan.clients):
             time.sleep(0.2)
         time.sleep(3.0)
         crew.stop("service")

@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from fusion_service import linalg
 from fusion_service.densities import chernoff_discrete
+from fusion_service.errors import FusionError
 from fusion_service.linalg import FloatArray
 
 __all__ = [
@@ -44,7 +45,7 @@ __all__ = [
 METHODS = ("consistent", "average", "geometric")
 
 
-class ExistenceError(ValueError):
+class ExistenceError(FusionError, ValueError):
     """Numbers that are no probabilities, rates or weights: one line that says which."""
 
 

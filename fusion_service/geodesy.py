@@ -15,6 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from fusion_service.errors import FusionError
 from fusion_service.linalg import congruence, matvec, outer, to_first, to_last
 from schemas import Ecef, Enu, Frame, Height, Local
 
@@ -44,7 +45,7 @@ MAX_HEIGHT_ERROR = 1e-6
 DERIVATIVES = (("x", "y", "z"), ("vx", "vy", "vz"), ("ax", "ay", "az"))
 
 
-class FrameError(ValueError):
+class FrameError(FusionError, ValueError):
     """A state cannot be moved from one frame to the other; the message says which and why."""
 
 

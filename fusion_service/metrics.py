@@ -19,6 +19,7 @@ __all__ = [
     "Gospa",
     "assign",
     "assign_near",
+    "chi2_quantile",
     "gospa",
     "identity_switches",
     "near_pairs",
@@ -166,6 +167,12 @@ def nees_bounds(n: int, samples: int, probability: float = 0.95) -> tuple[float,
     freedom = n * samples
     low, high = (2 * float(gammaincinv(freedom / 2, (1 + s * probability) / 2)) / freedom for s in (-1, 1))
     return low, high
+
+
+def chi2_quantile(probability: float, n: int) -> float:
+    """The value below which a chi-square variable of n degrees of freedom lies with this probability; the bits of
+    `scipy.stats.chi2.ppf`, without its time to import."""
+    return float(2.0 * gammaincinv(n / 2, probability))
 
 
 def identity_switches(assignments: Iterable[Mapping[Any, Any]]) -> int:

@@ -1,17 +1,36 @@
-"""What every process of ours does the same way: logs, signals in two stages, errors in one line."""
+"""What every process of ours does the same way: values of options, logs, signals in two stages, exit codes, and where
+recorded data are looked for.
+
+Exit codes: 0 done, or stopped by a signal; 2 bad usage or config; 1 any other failure, told in one line.
+"""
 
 from __future__ import annotations
 
+import argparse
 import logging
+import math
 import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
+from typing import TypeVar
 
-__all__ = ["GRACE", "set_up_logging", "stop_on_signals"]
+__all__ = [
+    "GRACE",
+    "argument",
+    "data_folder",
+    "exit_code",
+    "positive",
+    "set_up_logging",
+    "stop_on_signals",
+    "whole",
+]
+
+T = TypeVar("T")
 
 GRACE = 4.0
 """Seconds after the first signal in which a process must have ended by itself."""
@@ -71,3 +90,65 @@ def stop_on_signals() -> Iterator[threading.Event]:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def exit_code(program: str, call: Callable[[], object]) -> int:
+    """Call it, and tell on stderr what a person can mend, as `program: ...`; returns what the process ends with.
+
+    What is no `FusionError`, no missing package and no trouble with a file is a fault of ours, and raised on.
+    """
+    from fusion_service.errors import FusionError  # with NumPy: slow to load, so not before signals are heard
+
+    try:
+        call()
+    except FusionError as error:
+        if error.exit_code:
+            print(error if error.places else f"{program}: {error}", file=sys.stderr)
+        return error.exit_code
+    except BrokenPipeError:  # whoever read our output has gone; nothing is flushed into it at the end either
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (ImportError, OSError) as error:
+        print(f"{program}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def argument(read: Callable[[str], T]) -> Callable[[str], T]:
+    """`read` as the type of an argument of argparse: what its `ValueError` says is told of the option."""
+
+    def typed(text: str) -> T:
+        try:
+            return read(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    return typed
+
+
+def positive(text: str) -> float:
+    """A number above 0. Raises ValueError in one line."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0.0 < value < math.inf:
+        raise ValueError(f"{text!r} is not a number above 0")
+    return value
+
+
+def whole(text: str) -> int:
+    """A whole number from 0. Raises ValueError in one line."""
+    if not (text.isascii() and text.isdigit() and len(text) < 19):
+        raise ValueError(f"{text!r} is not a whole number from 0")
+    return int(text)
+
+
+def data_folder(name: str, given: str | Path | None = None) -> Path | None:
+    """The folder of the recorded data set `name`: `given`, or else $FUSION_DATA, may be that folder itself or one that
+    holds it under its name. None where neither says anything; whether the files are there is not looked at."""
+    said = given or os.environ.get("FUSION_DATA")
+    if not said:
+        return None
+    inside = Path(said) / name
+    return inside if inside.is_dir() else Path(said)

@@ -1,7 +1,7 @@
 """What crosses the bus: state spaces, messages, codec, key expressions. WIRE.md says it in words."""
 
 from schemas.codec import MAX_BYTES, VERSION, decode, digest, encode
-from schemas.errors import REASONS, MessageError
+from schemas.errors import REASONS, FusionError, MessageError
 from schemas.keys import REALM, Key, check_name, check_realm, global_key, local_key, parse_key, truth_key
 from schemas.messages import (
     DECISIONS,
@@ -52,6 +52,7 @@ __all__ = [
     "Entry",
     "Enu",
     "Frame",
+    "FusionError",
     "GlobalTracks",
     "Height",
     "Key",

@@ -30,14 +30,15 @@ class Key:
 
 
 def check_name(name: str) -> str:
-    """Return `name` if it can stand in a key: 1 to 64 letters, digits, `_.:-`, beginning with a letter or digit."""
+    """Return `name` if it can stand in a key: 1 to 64 letters, digits, `_.:-`, beginning with a letter or digit.
+    Raises ValueError if not."""
     if not _NAME.match(name):
         raise ValueError(f"bad name {name!r}: use 1 to 64 letters, digits or _ . : - and begin with a letter or digit")
     return name
 
 
 def check_realm(realm: str) -> str:
-    """Return `realm` if every chunk between its slashes is a name other than `v1`."""
+    """Return `realm` if every chunk between its slashes is a name other than `v1`. Raises ValueError if not."""
     for chunk in realm.split("/"):
         check_name(chunk)
         if chunk == VERSION:
@@ -46,26 +47,28 @@ def check_realm(realm: str) -> str:
 
 
 def local_key(source: str, what: str, realm: str = REALM) -> str:
-    """Key of a source; `what` is tracks, intensity, info or alive. `*` stands for any source."""
+    """Key of a source; `what` is tracks, intensity, info or alive. `*` stands for any source.
+    Raises ValueError for any other, and for what is no name or realm."""
     if what not in LOCAL:
         raise ValueError(f"no local key {what!r} (known: {' '.join(LOCAL)})")
     return f"{check_realm(realm)}/{VERSION}/local/{source if source == '*' else check_name(source)}/{what}"
 
 
 def global_key(centre: str, what: str, realm: str = REALM) -> str:
-    """Key of a centre; `what` is tracks, log, status, alive, picture or orders. `*` stands for any centre."""
+    """Key of a centre; `what` is tracks, log, status, alive, picture or orders. `*` stands for any centre.
+    Raises ValueError for any other, and for what is no name or realm."""
     if what not in GLOBAL:
         raise ValueError(f"no global key {what!r} (known: {' '.join(GLOBAL)})")
     return f"{check_realm(realm)}/{VERSION}/global/{centre if centre == '*' else check_name(centre)}/{what}"
 
 
 def truth_key(scenario: str, realm: str = REALM) -> str:
-    """Key of a scenario's truth. `*` stands for any scenario."""
+    """Key of a scenario's truth. `*` stands for any scenario. Raises ValueError for what is no name or realm."""
     return f"{check_realm(realm)}/{VERSION}/truth/{scenario if scenario == '*' else check_name(scenario)}"
 
 
 def parse_key(key: str) -> Key:
-    """The parts of a key; `ValueError` for anything that is not one of ours."""
+    """The parts of a key. Raises ValueError for anything that is not one of ours."""
     chunks = key.split("/")
     if len(chunks) >= 4 and chunks[-3:-1] == [VERSION, "truth"]:
         return Key(check_realm("/".join(chunks[:-3])), "truth", check_name(chunks[-1]), "")

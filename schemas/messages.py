@@ -26,6 +26,7 @@ __all__ = [
     "CONFIRMED_NOW",
     "DECISIONS",
     "DELETED",
+    "EXCHANGED",
     "GATE_FAILED",
     "IDENTITY_ORDERED",
     "IDENTITY_TWICE",
@@ -38,8 +39,10 @@ __all__ = [
     "SPLIT",
     "STATUSES",
     "TENTATIVE",
+    "U64",
     "Decisions",
     "Entry",
+    "Floats",
     "GlobalTracks",
     "Header",
     "LocalIntensity",
@@ -76,8 +79,9 @@ DECISIONS = (
     "confirmed",
     "coasting",
     "deleted",
+    "exchanged",
 )
-LINKED, KEPT, BROKEN, GATE_FAILED, MERGED, SPLIT, BORN, CONFIRMED_NOW, COASTING_NOW, DELETED = range(10)
+LINKED, KEPT, BROKEN, GATE_FAILED, MERGED, SPLIT, BORN, CONFIRMED_NOW, COASTING_NOW, DELETED, EXCHANGED = range(11)
 NO_SOURCE = 65535
 """The `source` of a decision that concerns no local track."""
 
@@ -254,7 +258,8 @@ class StepLog(Header):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Status(Header):
-    """Health of a centre. Counters grow since its start; `sources` maps a name to its own small map."""
+    """Health of a centre. Counters grow since its start; `sources` maps a name to its own small map;
+    `notes` are sentences about the centre that an operator should read."""
 
     type: ClassVar[str] = "status"
     time: int
@@ -268,6 +273,7 @@ class Status(Header):
     tracks: dict[str, int]
     step_time: dict[str, float]
     memory: int | None = None
+    notes: tuple[str, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

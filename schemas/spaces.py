@@ -42,7 +42,8 @@ COMPONENTS: dict[str, str] = {
 
 
 def check_space(space: tuple[str, ...]) -> tuple[str, ...]:
-    """Return `space` if it names one to all ten known components, each once, x and y among them."""
+    """Return `space` if it names one to all ten known components, each once, x and y among them.
+    Raises ValueError if not."""
     unknown = [name for name in space if name not in COMPONENTS]
     if unknown:
         raise ValueError(f"unknown component {unknown[0]!r} in the state space (known: {' '.join(COMPONENTS)})")

@@ -175,6 +175,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("tracks", _COUNTERS),
         _plain("step_time", _FLOATS, values.pack_floats),
         _plain("memory", values.u64, optional=True),
+        _plain("notes", values.list_of(values.text), list, optional=True),
     ),
     Truth: (*_HEADER, _TIME, *_WHERE, _IDS, _MEANS),
 }

@@ -19,7 +19,15 @@ from schemas.keys import check_name
 from schemas.messages import ORIGINS, Entry, Floats
 from schemas.spaces import Coverage, Disk, Ecef, Enu, Frame, Height, Local, Motion, Polygon, Sector, check_space
 
-__all__ = ["pack_lower", "unpack_lower"]
+__all__ = [
+    "Convert",
+    "check_symmetric",
+    "free_map",
+    "pack_column",
+    "pack_covariances",
+    "pack_lower",
+    "unpack_lower",
+]
 
 Convert: TypeAlias = Callable[[Any], Any]
 

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import os
-import signal
-import sys
-import threading
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from fusion_service.bus import DEFAULT_ENDPOINT, BusError, BusStopped
+from fusion_service.bus import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.errors import UsageError
+from fusion_service.process import argument, data_folder, exit_code, positive, stop_on_signals, whole
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
 from sensor_clients.playback import autoferry, table
@@ -35,24 +32,10 @@ EXAMPLES = """examples:
 """
 
 
-class UsageError(Exception):
-    """The command cannot be carried out as given; the message says how to mend it."""
-
-
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; 0: done, 2: bad usage, 1: failure with one line on stderr."""
+    """Run the command; returns the exit code, which is as that of `fusion-service`."""
     arguments = _parser().parse_args(argv)
-    try:
-        return int(arguments.run(arguments))
-    except UsageError as error:
-        print(f"sensor-client: {error}", file=sys.stderr)
-        return 2
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-    except (BusError, OSError, ValueError) as error:
-        print(f"sensor-client: {error}", file=sys.stderr)
-        return 1
+    return exit_code("sensor-client", lambda: arguments.run(arguments))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -65,23 +48,34 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     simulate = _command(commands, "simulate", "simulate a sensor and its local tracker", EXAMPLES)
     simulate.add_argument("scenario", help="three-radars")
-    simulate.add_argument("--seed", type=_whole, default=0, help="seed of noise and clutter (default 0)")
+    simulate.add_argument("--seed", type=argument(whole), default=0, help="seed of noise and clutter (default 0)")
     simulate.add_argument("--tracker", choices=TRACKERS, default="ckf", help="of the radars (default ckf); see list")
     simulate.set_defaults(run=_simulate)
     playback = _command(commands, "playback", "play recorded returns through a local tracker, or tracks", EXAMPLES)
     numbers = ", ".join(map(str, autoferry.SCENARIOS))
     playback.add_argument("scenario", help=f"autoferry:N, N one of {numbers}; or a .csv or .parquet file of tracks")
-    playback.add_argument("--data", type=Path, help="directory of the scenario files (default: $FUSION_DATA)")
+    playback.add_argument(
+        "--data", type=Path, help="directory of the scenario files, or that holds autoferry/ (default: $FUSION_DATA)"
+    )
     playback.set_defaults(run=_playback)
     for command in (simulate, playback):
         command.add_argument("--sensor", required=True, help="which of the scenario's sensors, or truth")
-        command.add_argument("--connect", default=DEFAULT_ENDPOINT, help=f"the hub (default {DEFAULT_ENDPOINT})")
+        command.add_argument(
+            "--connect",
+            type=argument(check_endpoint),
+            default=DEFAULT_ENDPOINT,
+            help=f"the hub (default {DEFAULT_ENDPOINT})",
+        )
         command.add_argument("--realm", default=REALM, help=f"first part of every key (default {REALM})")
-        command.add_argument("--speed", type=_positive, default=1.0, help="scenario seconds per second (default 1)")
+        command.add_argument(
+            "--speed", type=argument(positive), default=1.0, help="scenario seconds per second (default 1)"
+        )
         command.add_argument(
             "--start-at", type=float, metavar="UNIX_SECONDS", help="when the scenario starts (default: now)"
         )
-        command.add_argument("--duration", type=_positive, metavar="S", help="stop after S seconds of the scenario")
+        command.add_argument(
+            "--duration", type=argument(positive), metavar="S", help="stop after S seconds of the scenario"
+        )
     listing = _command(commands, "list", "scenarios, their sensors and parameters with their sources", EXAMPLES)
     listing.set_defaults(run=_list)
     return parser
@@ -94,28 +88,13 @@ def _command(commands: Any, name: str, text: str, epilog: str) -> argparse.Argum
     return parser
 
 
-def _positive(text: str) -> float:
-    value = float(text)
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not a positive number")
-    return value
-
-
-def _whole(text: str) -> int:
-    value = int(text)
-    if value < 0:
-        raise argparse.ArgumentTypeError(f"{text} is negative")
-    return value
-
-
-def _list(_: argparse.Namespace) -> int:
+def _list(_: argparse.Namespace) -> None:
     print(_describe(three_radars(), "simulate three-radars"))
     print("  trackers: " + "; ".join(f"{name}, {what}" for name, what in TRACKERS.items()))
     print()
     print(f"playback autoferry:N  N in {', '.join(map(str, autoferry.SCENARIOS))}: {autoferry.SUMMARY}")
     print(f"  sensors: {', '.join(autoferry.SENSORS)}, truth; needs --data or FUSION_DATA")
     print(_table(autoferry.PARAMETERS))
-    return 0
 
 
 def _describe(scenario: Scenario, command: str) -> str:
@@ -128,36 +107,35 @@ def _table(parameters: Sequence[Sequence[str]]) -> str:
     return "\n".join(f"    {name:{widths[0]}}  {value:{widths[1]}}  {source}" for name, value, source in parameters)
 
 
-def _simulate(arguments: argparse.Namespace) -> int:
+def _simulate(arguments: argparse.Namespace) -> None:
     if arguments.scenario != "three-radars":
         raise UsageError(f"no simulated scenario {arguments.scenario!r}; known: three-radars")
-    return _publish(three_radars(arguments.tracker), arguments, arguments.seed)
+    _publish(three_radars(arguments.tracker), arguments, arguments.seed)
 
 
-def _playback(arguments: argparse.Namespace) -> int:
+def _playback(arguments: argparse.Namespace) -> None:
     path = Path(arguments.scenario)
     if path.suffix in table.SUFFIXES:
-        return _publish(table.load(path), arguments, 0, table.lineage(path, arguments.sensor))
+        _publish(table.load(path), arguments, 0, table.lineage(path, arguments.sensor))
+        return
     name, _, number = arguments.scenario.partition(":")
     if name != "autoferry" or number not in map(str, autoferry.SCENARIOS):
         known = ", ".join(f"autoferry:{n}" for n in autoferry.SCENARIOS)
         raise UsageError(f"no recorded scenario {arguments.scenario!r}; known: {known}, or a .csv or .parquet file")
-    data = arguments.data or os.environ.get("FUSION_DATA")
-    if not data:
+    data = data_folder("autoferry", arguments.data)
+    if data is None:
         raise UsageError("no data: say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")
-    return _publish(autoferry.load(Path(data), int(number)), arguments, 0)
+    _publish(autoferry.load(data, int(number)), arguments, 0)
 
 
-def _publish(scenario: Scenario, arguments: argparse.Namespace, seed: int, lineage: Sequence[str] | None = None) -> int:
+def _publish(
+    scenario: Scenario, arguments: argparse.Namespace, seed: int, lineage: Sequence[str] | None = None
+) -> None:
     sensor = arguments.sensor
     if sensor != "truth" and sensor not in scenario.sensors:
         raise UsageError(
             f"no sensor {sensor!r} in {scenario.name}; known: {', '.join([*filter(None, scenario.sensors), 'truth'])}"
         )
-    try:
-        check_realm(arguments.realm)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
     events: Iterator[Event]
     kind: type[TrackPublisher] | type[TruthPublisher]
     if sensor == "truth":
@@ -170,25 +148,12 @@ def _publish(scenario: Scenario, arguments: argparse.Namespace, seed: int, linea
     where = {"connect": arguments.connect, "realm": arguments.realm, "origin": scenario.origin}
     if kind is TrackPublisher:
         where["lineage"] = lineage
-    with _stopped_by_signals() as stop, suppress(BusStopped), kind(name, stop=stop, **where) as publisher:
-        start_at = time.time() if arguments.start_at is None else arguments.start_at
-        pace(events, publisher, start=scenario.start, start_at=start_at, speed=arguments.speed, stop=stop)
-    return 0
-
-
-@contextmanager
-def _stopped_by_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT and SIGTERM set; a second signal ends the process at once."""
-    stop = threading.Event()
-
-    def handle(number: int, frame: object) -> None:
-        if stop.is_set():
-            os._exit(128 + number)
-        stop.set()
-
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield stop
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
+    with stop_on_signals() as stop:
+        try:
+            check_realm(arguments.realm)
+            opening = kind(name, stop=stop, **where)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        with opening as publisher:
+            start_at = time.time() if arguments.start_at is None else arguments.start_at
+            pace(events, publisher, start=scenario.start, start_at=start_at, speed=arguments.speed, stop=stop)

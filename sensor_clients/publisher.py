@@ -261,7 +261,8 @@ class TruthPublisher(_MessagePublisher):
     def truth(
         self, *, time: SupportsIndex, space: Sequence[str], frame: Frame, ids: ArrayLike, means: ArrayLike
     ) -> Truth:
-        """Publish the true states `means` (T, n) of the objects `ids` (T,) at `time` (ns UTC) in `frame`."""
+        """Publish the true states `means` (T, n) of the objects `ids` (T,) at `time` (ns UTC) in `frame`.
+        Raises `MessageError` for what cannot be sent, `BusError` if it is not open."""
         names = _space(space)
         states = _floats("means", means, (None, len(names)))
         if not np.isfinite(states).all():

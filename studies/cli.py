@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from fusion_service.process import data_folder
 from fusion_service.progress import Progress
 from studies import pictures, report
 from studies.rules import OwnRuleError, fuser
@@ -52,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         command.add_argument("--seed", type=_seed, default=1, metavar="S", help="(default %(default)s)")
         command.add_argument("--jobs", type=_count, default=os.cpu_count() or 1, metavar="N", help="processes")
         command.add_argument(
-            "--data", type=Path, default=os.environ.get("FUSION_DATA"), metavar="DIR", help="Autoferry's folder"
+            "--data", metavar="DIR", help="Autoferry's folder, or what holds autoferry/ (default: $FUSION_DATA)"
         )
     commands.add_parser("page", help="make docs/studies.md", epilog=PAGE, formatter_class=form)
     args = parser.parse_args(arguments)
@@ -61,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _list(known)
     if args.command == "page":
         return _page(known)
-    run = Run(0, args.seed, data=args.data, jobs=args.jobs)
+    run = Run(0, args.seed, data=data_folder("autoferry", args.data), jobs=args.jobs)
     for name in args.names if args.command == "all" else [args.name]:
         if name not in known:
             parser.error(f"no study {name!r}; there are {', '.join(known)}")

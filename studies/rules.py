@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.errors import FusionError
 from fusion_service.rules import RULES, RuleError, fuse_last
 from fusion_service.rules.face import Fused
 
@@ -23,7 +24,7 @@ __all__ = ["Fuser", "OwnRuleError", "fuser"]
 Floats = NDArray[np.float64]
 
 
-class OwnRuleError(Exception):
+class OwnRuleError(FusionError):
     """A rule of the user's own failed or gave something else than a mean and a covariance; one line."""
 
 

@@ -19,6 +19,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.errors import FusionError
 from studies.rules import Fuser
 
 __all__ = ["MissingDataError", "Result", "Row", "Run", "Study", "catalogue"]
@@ -28,7 +29,7 @@ Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
 
-class MissingDataError(ValueError):
+class MissingDataError(FusionError, ValueError):
     """A study of real data has not been told where they are: one line that says how to."""
 
 

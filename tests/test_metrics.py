@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from fusion_service import metrics
 from fusion_service.metrics import gospa, identity_switches, near_pairs, nees, nees_bounds, ospa
-from fusion_service.review.evaluation.continuity import Following, Moment, ospa2, siap_of
+from fusion_service.review.evaluation.continuity import Following, Instant, ospa2, siap_of
 
 Array = NDArray[np.float64]
 SEED = 20250704
@@ -153,7 +153,7 @@ def test_a_large_connected_part_is_assigned_on_its_pairs() -> None:
 
 def moments(
     rng: np.random.Generator, times: int
-) -> tuple[list[Moment], list[dict[int, Array]], list[dict[int, Array]]]:
+) -> tuple[list[Instant], list[dict[int, Array]], list[dict[int, Array]]]:
     """Objects and tracks that come and go at random in a small place; the numbers are not 0, 1, 2."""
     found, objects, tracks, c = [], [], [], 5.0
     for _ in range(times):
@@ -166,7 +166,7 @@ def moments(
         a, b = (np.array(list(one.values())).reshape(-1, 2) for one in (here, shown))
         numbers = [np.array(list(one), dtype=np.intp) for one in (here, shown)]
         i, j, d = near_pairs(a, b, c)
-        found.append(Moment(numbers[0], numbers[1], numbers[0][i], numbers[1][j], d))
+        found.append(Instant(numbers[0], numbers[1], numbers[0][i], numbers[1][j], d))
     return found, objects, tracks
 
 

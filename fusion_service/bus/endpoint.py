@@ -12,7 +12,7 @@ _OTHER = re.compile(r"(?:unixsock-stream|unixpipe|serial|vsock)/\S+")
 
 
 def check_endpoint(text: str) -> str:
-    """Return `text` if it is an endpoint, `ValueError` if not."""
+    """Return `text` if it is an endpoint. Raises ValueError if not."""
     found = _ENDPOINT.fullmatch(text)
     if not (found and int(found[1]) < 65536) and not _OTHER.fullmatch(text):
         raise ValueError(f"{text!r} is not an endpoint: write protocol/host:port, as in {DEFAULT_ENDPOINT}")

@@ -14,7 +14,8 @@ log = logging.getLogger(__name__)
 
 
 def run_hub(listen: Sequence[str] = (DEFAULT_ENDPOINT,), stop: threading.Event | None = None) -> None:
-    """Route between all who connect to `listen` until `stop` is set. `BusError` if an endpoint is in use or bad."""
+    """Route between all who connect to `listen` until `stop` is set. Raises `BusError` if an endpoint
+    is in use or bad."""
     stop = stop or threading.Event()
     with open_bus(listen=listen, mode="router"):
         log.info("the hub listens on %s", ", ".join(listen))

@@ -25,6 +25,7 @@ import zenoh
 from zenoh import ext
 
 from fusion_service.bus.inbox import Inbox
+from fusion_service.errors import FusionError, Stopped
 from schemas import MAX_BYTES
 
 __all__ = [
@@ -51,11 +52,11 @@ MAX_PUBLISHERS = 4096
 log = logging.getLogger(__name__)
 
 
-class BusError(Exception):
+class BusError(FusionError):
     """What the user can mend about the bus, in one line."""
 
 
-class BusStopped(BusError):
+class BusStopped(Stopped, BusError):
     """`stop` was set while waiting for the hub."""
 
 
@@ -110,7 +111,7 @@ class Publisher(Declaration):
 
     def put(self, data: bytes) -> None:
         """Publish `data`; never waits for a slow reader. While the hub is away nothing is sent, but the last
-        `cache` samples go out when it is back. `BusError` if it is closed or the data are too long."""
+        `cache` samples go out when it is back. Raises `BusError` if it is closed or the data are too long."""
         if len(data) > MAX_BYTES:
             raise BusError(f"{len(data)} bytes are too many for one message: at most {MAX_BYTES}")
         try:
@@ -228,7 +229,7 @@ class Bus:
 
     def ask(self, key: str, payload: bytes | None = None, timeout: float = 1.0) -> list[tuple[str, bytes]]:
         """Ask everyone who answers on `key` (an expression may reach several): (key, data) of each answer,
-        none if nobody is there. `BusError` if all that came are errors or `timeout` seconds have passed.
+        none if nobody is there. Raises `BusError` if all that came are errors or `timeout` seconds have passed.
         Waits: not for use in a callback."""
         with _readable(key):
             replies = list(
@@ -273,7 +274,7 @@ def open_bus(
     connect, listen: endpoints as "tcp/host:port"; a client connects and a router listens at
     `DEFAULT_ENDPOINT` unless told otherwise. A client waits for its hub: for ever (`wait=True`), so many
     seconds, or for one try (False, 0); signals and `stop` interrupt it at once. It reconnects by itself later on.
-    A router or peer connects in the background. `BusError` in one line if an endpoint is bad, in use or not
+    A router or peer connects in the background. Raises `BusError` in one line if an endpoint is bad, in use or not
     to be reached in time, `BusStopped` if `stop` was set.
     """
     if mode == "client":

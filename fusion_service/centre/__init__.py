@@ -3,6 +3,7 @@
 from fusion_service.centre.centre import Centre, StepResult
 from fusion_service.centre.checkpoint import CheckpointError
 from fusion_service.centre.clock import MessageClock, WallClock
+from fusion_service.centre.era import ClockSet, NewEra
 from fusion_service.centre.fusion import FusionCentre
 from fusion_service.centre.intake import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.intensity import IntensityCentre
@@ -15,11 +16,13 @@ __all__ = [
     "WHAT",
     "Centre",
     "CheckpointError",
+    "ClockSet",
     "Event",
     "FusionCentre",
     "IntensityCentre",
     "LocalId",
     "MessageClock",
+    "NewEra",
     "Order",
     "Outcome",
     "Refused",

@@ -66,6 +66,11 @@ class Twice:
                 over = {"kind": "alarm_over", "what": "identity-twice", "identity": name, "tracks": tracks}
                 journal.event(over)
 
+    def rebase(self, time: int) -> None:
+        """A new era begins at `time`, ns: nothing was seen later."""
+        for standing in self.standing.values():
+            standing[0] = min(standing[0], time)
+
     def tracks(self) -> set[int]:
         """The global ids concerned."""
         return {track for _, *tracks in self.standing.values() for track in tracks}

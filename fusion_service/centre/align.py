@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.centre.intake import Intake
+from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import Columns, Tracks, join_tracks, no_parts
+from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
 from fusion_service.densities import Mixtures
 from fusion_service.motion import predict
 from schemas import Entry, Motion
@@ -19,23 +21,25 @@ from schemas import Entry, Motion
 __all__ = ["predict_tracks", "usable_rows", "write_back"]
 
 PARTS = ("log_weight", "part_mean", "part_covariance")
-LINK_COLUMNS = ("link", "since", "fails", "used", "told")
 
 
 def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table, and
-    so does what has no sound density there (refused: ill-conditioned)."""
+    so does what has no sound density there (refused: ill-conditioned); what is not used, and why, is told."""
     config = intake.config
     parts: list[Tracks] = []
     index: list[NDArray[np.intp]] = []
     epochs: list[NDArray[np.uint64]] = []
     starts: list[NDArray[np.bool_]] = []
+    interval: list[NDArray[np.int64]] = []
+    lost: list[NDArray[np.bool_]] = []
     kept: dict[str, int] = {}
+    room = MAX_TOTAL // max(len(intake.sources), 1)
     for number, (name, source) in enumerate(sorted(intake.sources.items())):
         said = intake.declared(source)
-        oldest = time - round(config.stale_periods * said.period * 1e9)
-        source.tracks = table = source.tracks.take(source.tracks.time >= oldest)
+        table = retire(source, said, time, room, config)
         if source.muted or not intake.ready(source):
+            leave_out(source)
             continue
         predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
@@ -48,10 +52,25 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         index.append(np.full(count, number, dtype=np.intp))
         epochs.append(np.full(count, source.epoch, dtype=np.uint64))
         starts.append(np.full(count, said.may_start, dtype=np.bool_))
+        interval.append(table.interval[sound])
+        lost.append(np.full(count, source.alive is False, dtype=np.bool_))
     if not parts:
-        nothing = intake.nothing()
-        return Rows(np.zeros(0, dtype=np.intp), nothing.id, nothing, np.zeros(0, dtype=np.bool_), kept)
-    return Rows(np.concatenate(index), np.concatenate(epochs), join_tracks(parts), np.concatenate(starts), kept)
+        parts.append(intake.nothing())
+    tracks = join_tracks(parts)
+    return Rows(
+        source=_joined(index, np.intp),
+        epoch=_joined(epochs, np.uint64),
+        tracks=tracks,
+        may_start=_joined(starts, np.bool_),
+        interval=_joined(interval, np.int64),
+        lost=_joined(lost, np.bool_),
+        fresh=tracks.updated > tracks.judged,
+        kept=kept,
+    )
+
+
+def _joined(parts: list[NDArray[Any]], kind: type[np.generic]) -> NDArray[Any]:
+    return np.concatenate([np.zeros(0, kind), *parts])
 
 
 def predict_tracks(
@@ -84,5 +103,5 @@ def write_back(rows: Rows, intake: Intake) -> None:
     start = 0
     for name, count in rows.kept.items():
         source, part = intake.sources[name], slice(start, start + count)
-        source.tracks = replace(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINK_COLUMNS})
+        source.tracks = replace(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINKS})
         start += count

@@ -15,9 +15,13 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
-from fusion_service.centre.checkpoint import pack_state, unpack_state
+from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
+from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.intake import Event, Intake
 from fusion_service.centre.journal import Journal, start_event
@@ -73,24 +77,41 @@ class Centre(ABC):
         self._published = 0
         self._time = -1
         self._journal = Journal(self.config.name, self.config_hash, __version__)
+        self._era = EraWatch(self.config)
         self._begin()
         if checkpoint is not None:
-            state, self._picture = unpack_state(checkpoint, self._intake, self._labels, self.config.space)
+            state, self._picture = unpack_state(checkpoint, self._intake, self._labels)
             self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
-            self._restore(state)
+            self._era.unpack(state["era"])
+            try:
+                if state["own"] is not None:
+                    self._restore(state["own"])
+            except Exception as error:
+                raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
         if generation is not None:
             self._ids.begin(generation)
         self._journal.event(start_event(self.config, epoch, generation, checkpoint))
 
     @property
     def time(self) -> int:
-        """Time of the newest step, ns; -1 before the first."""
+        """Time of the newest step, ns; -1 before the first. A new era may set it back (see `era`)."""
         return self._time
 
     def handle(self, event: Event, received: int) -> None:
         """Queue a message or another event for the next step; `received` is when it came, ns. Never raises
         for what a message contains: it is checked, and refused with a reason, in the step."""
-        self._intake.put(event, received)
+        era = self._era.judge(event, received, self._time)
+        if era is not None:
+            self._begin_era(era, received)
+        if not isinstance(event, (ClockSet, NewEra)):
+            self._intake.put(event, received)
+
+    def _begin_era(self, time: int, now: int) -> None:
+        self._journal.event(self._era.begin(time, self._time))
+        self._time = time
+        self._intake.rebase(time, now)
+        self._labels.rebase(time)
+        self._picture = rebased(self._picture, GLOBAL_TIMES, time)
 
     def step(self, time: int) -> StepResult:
         """Make the step at `time`, ns, which must be after the last. `ValueError` if it is not."""
@@ -101,6 +122,9 @@ class Centre(ABC):
         self._obey(self._intake.take_orders(), time)
         self._intake.admit(time, self._time, journal)
         self._time = time
+        if self._intake.reframed:
+            self._intake.reframed = False
+            self._end_all(self._picture.id, "frame")
         rows = usable_rows(self._intake, time, journal)
         names = self._intake.names()
         journal.name_sources(names)
@@ -122,7 +146,7 @@ class Centre(ABC):
         )
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
-        status = step_status(self._intake, journal, log, self._numbers(), self.refusals())
+        status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), self._era.notes(time))
         return StepResult(tracks, log, status)
 
     def refusals(self) -> dict[str, int]:
@@ -145,7 +169,8 @@ class Centre(ABC):
             "step": self._step,
             "time": self._time,
             "next_id": self._ids.next,
-            **self._kept(),
+            "era": self._era.pack(),
+            "own": self._kept(),
         }
         return pack_state(self.config_hash, state, self._intake, self._labels, self._picture)
 
@@ -180,9 +205,18 @@ class Centre(ABC):
         """Undo whatever refers to global tracks that are no more."""
 
     def _obey(self, orders: list[Order], time: int) -> None:
-        self._picture, gone = obey(orders, self._intake, self._picture, self._ids, self._journal, time)
-        if gone:
-            self._forget(gone)
+        obeyed = obey(orders, self._intake, self._picture, self._ids, self._journal, time, self._step)
+        self._picture = obeyed.picture
+        if obeyed.gone:
+            self._forget(obeyed.gone)
+
+    def _end_all(self, tracks: NDArray[np.uint64], reason: str) -> None:
+        """End those of these global tracks that there are."""
+        gone = np.isin(self._picture.id, tracks)
+        for track in self._picture.id[gone].tolist():
+            self._journal.end(track, reason, None)
+        self._forget(self._picture.id[gone].tolist())
+        self._picture = self._picture.take(~gone)
 
     def _numbers(self) -> dict[str, int]:
         kinds = Counter(self._picture.status.tolist())

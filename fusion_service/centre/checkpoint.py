@@ -11,10 +11,16 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgpack
 import numpy as np
+from numpy.typing import NDArray
 
+from fusion_service.centre.frames import Vote
+from fusion_service.centre.intervals import NOTHING_REMEMBERED, Remembered
 from fusion_service.centre.lifecycle import Picture, empty_picture
+from fusion_service.centre.restoring import fit_config
 from fusion_service.centre.sources import Source, Tracks, empty_tracks, padded
 from fusion_service.centre.words import Lexicon, Words
+from fusion_service.errors import FusionError
+from fusion_service.order import Order
 from schemas import Ecef, Enu, Frame, Local, SensorInfo, decode, encode
 
 if TYPE_CHECKING:
@@ -23,17 +29,26 @@ if TYPE_CHECKING:
 
 __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
 
-CHECKPOINT_VERSION = 1
+CHECKPOINT_VERSION = 2
+READABLE = (1, 2)
+MISSING: dict[str, float] = {
+    **dict.fromkeys(("since", "used", "judged", "weighed", "seen", "told", "last_hit", "due"), -1),
+    "identity": -1,
+    "kind": -1,
+    "kind_p": np.nan,
+}
+"""What columns hold that may not be in a checkpoint of an earlier release; others hold 0."""
 _PLAIN = (
     *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
-    *("origin", "waited", "highest", "first"),
+    *("origin", "waited", "highest", "first", "interval", "why", "unused"),
 )
-_ADDED: dict[str, float] = {"identity": -1, "kind": -1, "kind_p": np.nan, "origin": 0, "told": -1}
-"""Columns that a checkpoint of this version may lack, and what they then hold."""
+_LATER = ("interval", "why", "unused")
+"""What a checkpoint of an earlier release does not hold."""
+NO_ERA = (0, -1, -1, 0, -1, -1)
 Columns = TypeVar("Columns", Tracks, Picture)
 
 
-class CheckpointError(ValueError):
+class CheckpointError(FusionError, ValueError):
     """A checkpoint that cannot be used, and why, in one line."""
 
 
@@ -44,6 +59,7 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: 
         "config_hash": config_hash,
         "kind": intake.config.kind,
         "frame": _pack_frame(intake.frame),
+        "frame_asked": intake.voting.asked,
         "sources": {name: _pack_source(source) for name, source in sorted(intake.sources.items())},
         "picture": _pack_columns(picture),
         "orders": intake.orders.kept(),
@@ -54,36 +70,44 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: 
     return cast(bytes, msgpack.packb(whole))
 
 
-def unpack_state(blob: bytes, intake: Intake, labels: Labels, space: tuple[str, ...]) -> tuple[dict[str, Any], Picture]:
-    """Fill the intake, and return the rest and the picture. `CheckpointError` if it does not fit this centre."""
+def unpack_state(blob: bytes, intake: Intake, labels: Labels) -> tuple[dict[str, Any], Picture]:
+    """Fill intake and labels, and return the rest and the picture, in the space and frame of the config.
+    `CheckpointError` if it is of another kind of centre, or cannot be read."""
     try:
         whole = msgpack.unpackb(blob)
         version = whole["v"]
-        if version != CHECKPOINT_VERSION:
+        if version not in READABLE:
             raise CheckpointError(f"the checkpoint is of version {version}, this is {CHECKPOINT_VERSION}")
         if whole.get("kind", "tracks") != intake.config.kind:
             raise CheckpointError(f"the checkpoint is of a centre that fuses {whole['kind']}, not {intake.config.kind}")
-        if tuple(whole["space"]) != space:
-            raise CheckpointError("the checkpoint is in another state space than the config")
-        frame = _unpack_frame(whole["frame"])
-        if intake.config.frame is not None and frame not in (None, intake.config.frame):
-            raise CheckpointError("the checkpoint is in another frame than the config")
+        was, frame = tuple(whole["space"]), _unpack_frame(whole["frame"])
         sources = {name: _unpack_source(name, packed) for name, packed in whole["sources"].items()}
-        picture = _unpack_columns(whole["picture"], empty_picture(len(space)))
+        picture = _unpack_columns(whole["picture"], empty_picture(len(was)))
+        picture = fit_config(sources, picture, was, frame, intake.config)
+        asked = int(whole.get("frame_asked", -1))
+        era = [int(part) for part in whole.get("era", NO_ERA)]
         numbers = {name: int(whole[name]) for name in ("step", "time", "next_id")}
-        agreeing = {(int(a), int(b)): int(count) for a, b, count in whole["agreeing"]}
-        if "orders" in whole:
-            intake.orders.restore(whole["orders"])
-        if "labels" in whole:
-            labels.restore(whole["labels"])
-        intake.said = Lexicon(*(Words(texts) for texts in whole.get("said", [[], []])))
+        _restore_words(whole, sources, intake, labels)
     except CheckpointError:
         raise
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
-    intake.frame, intake.sources = frame or intake.config.frame, sources
+    intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
     intake.mute()
-    return {**numbers, "agreeing": agreeing}, picture
+    return {**numbers, "era": era, "own": whole.get("own")}, picture
+
+
+def _restore_words(whole: dict[str, Any], sources: dict[str, Source], intake: Intake, labels: Labels) -> None:
+    """What was ordered and said. In a checkpoint of an earlier release a muted source is all there is of orders."""
+    intake.said = Lexicon(*(Words(texts) for texts in whole.get("said", [[], []])))
+    if "labels" in whole:
+        labels.restore(whole["labels"])
+    if "orders" in whole:
+        intake.orders.restore(whole["orders"])
+        return
+    for name, source in sorted(sources.items()):
+        if source.muted and not intake.config.source(name).ignore:
+            intake.orders.stand(intake.orders.numbered(Order("mute", name)))
 
 
 def _pack_source(source: Source) -> dict[str, Any]:
@@ -92,6 +116,9 @@ def _pack_source(source: Source) -> dict[str, Any]:
     packed["seen"] = [list(key) for key in source.seen]
     packed["info"] = None if source.info is None else encode(source.info)
     packed["tracks"] = _pack_columns(source.tracks)
+    packed["remembered"] = [_bytes(column) for column in source.remembered]
+    if source.vote is not None:
+        packed["vote"] = [_pack_frame(source.vote.frame), list(source.vote.space), source.vote.time]
     return packed
 
 
@@ -99,7 +126,15 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
     space = tuple(packed["space"])
     source = Source(name, space, _unpack_columns(packed["tracks"], empty_tracks(len(space))))
     for plain in _PLAIN:
-        setattr(source, plain, packed[plain])
+        if plain in packed or plain not in _LATER:
+            setattr(source, plain, packed[plain])
+    if "remembered" in packed:
+        kinds = NOTHING_REMEMBERED
+        columns = (_array(one, like) for one, like in zip(packed["remembered"], kinds, strict=True))
+        source.remembered = Remembered(*columns)
+    if "vote" in packed:
+        spoken, names, time = packed["vote"]
+        source.vote = Vote(_unpack_frame(spoken) or Local("none"), tuple(names), time)
     source.seen = deque((kind, seq, code) for kind, seq, code in packed["seen"])
     source.seen_set = set(source.seen)
     if packed["info"] is not None:
@@ -113,9 +148,16 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
 def _pack_columns(columns: Tracks | Picture) -> dict[str, Any]:
     packed: dict[str, Any] = {"components": len(columns.log_weight)}
     for one in fields(columns):
-        array = getattr(columns, one.name)
-        packed[one.name] = np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+        packed[one.name] = _bytes(getattr(columns, one.name))
     return packed
+
+
+def _bytes(array: NDArray[Any]) -> bytes:
+    return np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
+
+
+def _array(packed: bytes, like: NDArray[Any]) -> NDArray[Any]:
+    return np.frombuffer(packed, dtype=like.dtype.newbyteorder("<")).astype(like.dtype)
 
 
 def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
@@ -124,10 +166,8 @@ def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
     arrays = []
     for one in fields(like):
         empty = getattr(like, one.name)
-        if one.name not in packed and one.name in _ADDED:
-            arrays.append(np.full(count, _ADDED[one.name]).astype(empty.dtype))
-            continue
-        flat = np.frombuffer(packed[one.name], dtype=empty.dtype.newbyteorder("<")).astype(empty.dtype)
+        blank = np.full(count, MISSING.get(one.name, 0)).astype(empty.dtype)
+        flat = blank if one.name not in packed else _array(packed[one.name], empty)
         arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)
 

@@ -26,21 +26,17 @@ class WallClock:
         self.skipped = 0
 
     def due(self, now: int) -> int | None:
-        """Time of the step to make now, ns, or None."""
+        """Time of the step to make now, ns, or None. Where the clock was set back by more than a period, it is
+        before the last one: the centre judges by `ClockSet` whether a new era begins."""
         newest = (now - self._delay) // self._period * self._period
         if self._last < 0:
             self._last = newest
             return None
-        if newest <= self._last:
+        if self._last - self._period <= newest <= self._last:
             return None
-        self.skipped += (newest - self._last) // self._period - 1
+        self.skipped += max(0, (newest - self._last) // self._period - 1)
         self._last = newest
         return newest
-
-    def behind(self, now: int) -> float:
-        """Seconds until `now` is where the last step was: above 0 where the clock was set back. No step is due
-        until then, since the centre goes only forward."""
-        return max(0.0, (self._last + self._delay - now) / 1e9) if self._last >= 0 else 0.0
 
     def wait(self, now: int) -> float:
         """Seconds until the next step is due."""
@@ -80,12 +76,17 @@ class MessageClock:
     leads has no vote, and the clock waits for nobody who is behind by more than one, or
     was refused last.
 
+    What is too late for the newest step is for the centre to refuse, in the next step; but where nothing else comes
+    there is none, so that it is refused at once (`observe`). Where that has gone on for the lead, time was set back
+    for everybody, and steps begin again from there.
+
     Spans without any message are skipped. At most `MAX_NAMES` sources are known: beyond, a tenth of them is
     forgotten, those without a token first, the longest silent among them.
     """
 
     LEAD = 60.0
     IDLE = 100
+    FEW = 3
     MAX_NAMES = 1000
 
     def __init__(self, config: CentreConfig) -> None:
@@ -101,22 +102,32 @@ class MessageClock:
         """No later than the median of the live sources' claims."""
         self._times: list[int] = []
         self._waiting: set[int] = set()
+        self._late = 0
+        """Messages that were too late since the last that was not; their newest time, and how far it has gone on."""
+        self._late_newest = -1
+        self._late_waited = 0
 
-    def admits(self, message: LocalTracks | LocalIntensity, received: int) -> bool:
-        """Observe a message that came at `received`, ns. False: refuse it as too far ahead, of its reception or of
-        the others."""
+    def fault(self, message: LocalTracks | LocalIntensity, received: int) -> str:
+        """Observe a message that came at `received`, ns, and say why to refuse it: `future`, too far ahead of its
+        reception or of the others; `late`, when no step will be made that tells; empty: take it."""
         if max(message.time, message.epoch) > horizon(received, self._config):
-            return False
-        return self.observe(message.source, message.epoch, message.time)
+            return "future"
+        late = self._is_late(message.time)
+        return "" if self.observe(message.source, message.epoch, message.time) else "late" if late else "future"
 
     def observe(self, source: str, epoch: int, time: int) -> bool:
-        """A message of this run of `source` holds at `time`, ns. False: too far ahead of the others, refuse it."""
+        """A message of this run of `source` holds at `time`, ns. False: refuse it, as too far ahead of the others, or
+        as too late where `FEW` before it were so, and none was not."""
         one = self._source(source)
         if epoch > one.epoch:
             known = one.claimed >= 0
             one.epoch, one.claimed, one.newest, one.refused = epoch, -1, -1, -1
             if known:
                 self._look_again()
+        if not self._is_late(time):
+            self._late = 0
+        elif not self._is_set_back(time):
+            self._late += 1
         one.claimed = max(time, one.claimed)
         self._reference = min(self._reference, one.claimed)
         if time > self._reference + self._lead:
@@ -129,12 +140,31 @@ class MessageClock:
         self._front = max(time, self._front)
         if self._next is None or time > self._next - self._period:
             self._wait_for(time)
-        return True
+        return self._late <= self.FEW
 
     def presence(self, source: str, alive: bool) -> None:
         """The token of `source` came or went."""
         self._source(source).token = alive
         self._reference = -1
+
+    def _is_late(self, time: int) -> bool:
+        """Whether the step for what holds at `time` was made long ago."""
+        return self._next is not None and time < self._next - self._period - self._lateness
+
+    def _is_set_back(self, time: int) -> bool:
+        """Whether everybody's time is set back: a late message, and nothing else for the lead by its own count. Then
+        steps begin anew."""
+        if not self._late:
+            self._late_newest, self._late_waited = time, 0
+        self._late_waited += min(max(time - self._late_newest, 0), self._lead // 10)
+        self._late_newest = max(time, self._late_newest)
+        if self._late_waited < self._lead:
+            return False
+        for one in self._sources.values():
+            one.claimed = one.newest = one.refused = -1
+        self._next, self._front, self._reference, self._late = None, -1, -1, 0
+        self._times, self._waiting = [], set()
+        return True
 
     def _source(self, name: str) -> _Source:
         if name not in self._sources:

@@ -45,8 +45,8 @@ def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, jour
     recursive memory it is the product of the shares in the two stages.
     """
     tracks = rows.tracks
-    linked = tracks.link != NO_TRACK
-    influence = np.where(linked, 0.0, np.nan)
+    linked = (tracks.link != NO_TRACK) & ~tracks.outside
+    influence = np.where(tracks.link != NO_TRACK, 0.0, np.nan)
     used = linked if config.memory == "restart" else linked & (tracks.time > tracks.used)
     chosen = np.flatnonzero(used)
     mean, covariance = picture.mean.copy(), picture.covariance.copy()

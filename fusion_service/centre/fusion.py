@@ -11,13 +11,14 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.align import predict_tracks, write_back
 from fusion_service.centre.centre import Centre
-from fusion_service.centre.existence import existence_now
+from fusion_service.centre.existence import Entries, update_existence
 from fusion_service.centre.fusing import fuse_all
-from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.lifecycle import Picture, Support
 from fusion_service.centre.linking import Linker
 from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.publishing import Contributions, live_on
-from fusion_service.centre.rows import Rows
+from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import relinked
 from fusion_service.config import CentreConfig
 
 __all__ = ["FusionCentre"]
@@ -37,12 +38,16 @@ class FusionCentre(Centre):
 
     def _begin(self) -> None:
         self._linker = Linker(self.config, self._ids)
+        self._entries = Entries()
+        self._last = -1
 
     def _kept(self) -> dict[str, Any]:
-        return {"agreeing": [[a, b, count] for (a, b), count in sorted(self._linker.agreeing.items())]}
+        return {**self._linker.packed(), "entries": self._entries.packed()}
 
     def _restore(self, state: dict[str, Any]) -> None:
-        self._linker.agreeing = state["agreeing"]
+        self._linker.restore(state)
+        self._entries = Entries.unpacked(state["entries"])
+        self._last = self._time
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         self._associate(rows, names, time)
@@ -61,18 +66,15 @@ class FusionCentre(Centre):
         old = np.array(sorted(new), dtype=np.uint64)
         to = np.array([new[track] for track in old.tolist()], dtype=np.uint64)
         for source in self._intake.sources.values():
-            link = source.tracks.link
-            at = np.minimum(np.searchsorted(old, link), len(old) - 1)
-            source.tracks = replace(source.tracks, link=np.where(old[at] == link, to[at], link))
+            at = np.flatnonzero(np.isin(source.tracks.link, old))
+            if len(at):
+                link = to[np.searchsorted(old, source.tracks.link[at])]
+                source.tracks = relinked(source.tracks, at, link, self._step)
 
     def _associate(self, rows: Rows, names: tuple[str, ...], time: int) -> None:
-        linker, journal = self._linker, self._journal
-        meeting = Meeting(self._intake, self._labels, rows, self._picture.id, names)
-        rows.tracks.link[meeting.forced_row] = meeting.forced_track
-        linker.check(rows, journal)
         now = self._predicted(time)
-        self._picture, agreements = linker.link(rows, self._picture, now, meeting, self._step, time, journal)
-        merged = linker.merge(rows, agreements, self._step, journal)
+        meeting = Meeting(self._intake, self._labels, rows, now.id, names)
+        self._picture, merged = self._linker.link(rows, self._picture, now, meeting, self._step, time, self._journal)
         self._relink(merged)
         if merged:
             gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
@@ -84,23 +86,37 @@ class FusionCentre(Centre):
         return predict_tracks(picture, config.motion, config.space, config.space, dt)
 
     def _live(self, rows: Rows, time: int) -> None:
-        tracks, picture, linked = rows.tracks, self._picture, rows.linked()
-        at = picture.find(tracks.link[linked])
-        support = np.bincount(at, minlength=len(picture.id))
-        updated = picture.updated.copy()
-        np.maximum.at(updated, at, tracks.updated[linked])
-        newest = np.full(len(picture.id), -1, dtype=np.int64)
-        np.maximum.at(newest, at, tracks.time[linked])
-        fresh = newest > picture.seen
-        existence = existence_now(rows, picture, fresh, self._intake, time)
+        tracks, picture, inside = rows.tracks, self._picture, rows.inside()
+        at = picture.find(tracks.link[inside])
+        updated, newest = picture.updated.copy(), np.full(len(picture.id), -1, dtype=np.int64)
+        np.maximum.at(updated, at, tracks.updated[inside])
+        np.maximum.at(newest, at, tracks.time[inside])
         seen = np.maximum(picture.seen, newest)
-        picture = replace(picture, updated=updated, existence=existence, seen=seen)
-        picture, ended = live_on(picture, time, support, fresh, self.config, self._journal)
+        picture = replace(picture, updated=updated, seen=seen)
+        picture = update_existence(rows, picture, self._intake, self._entries, time, self._last)
+        self._last = time
+        support = self._support(rows, inside, at, len(picture.id), time)
+        picture, ended = live_on(picture, time, support, self.config, self._journal)
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
+        tracks.link[np.isin(tracks.link, picture.id[ended])] = NO_TRACK
         self._picture = picture.take(~ended)
 
+    def _support(self, rows: Rows, inside: NDArray[np.intp], at: NDArray[np.intp], count: int, time: int) -> Support:
+        """What feeds each global track. A report is overdue by half of its interval, or a step, whichever is longer;
+        where the source's token is gone, by nothing."""
+        interval = rows.interval[inside]
+        slack = np.maximum(interval // 2, round(self.config.period * 1e9))
+        expected = rows.tracks.seen[inside] + interval + np.where(rows.lost[inside], 0, slack)
+        due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
+        np.maximum.at(due, at, expected)
+        np.maximum.at(slowest, at, interval)
+        sources = np.bincount(at[expected >= time], minlength=count)
+        hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
+        linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
+        return Support(sources, hit, due, slowest, linked == 0)
+
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
-        picture, tracks, linked = self._picture, rows.tracks, rows.linked()
-        linked = linked[np.argsort(tracks.link[linked], kind="stable")]
-        counts = np.bincount(picture.find(tracks.link[linked]), minlength=len(picture.id))
-        return Contributions(counts, rows.source[linked], rows.epoch[linked], tracks.id[linked], influence[linked])
+        picture, tracks, inside = self._picture, rows.tracks, rows.inside()
+        inside = inside[np.argsort(tracks.link[inside], kind="stable")]
+        counts = np.bincount(picture.find(tracks.link[inside]), minlength=len(picture.id))
+        return Contributions(counts, rows.source[inside], rows.epoch[inside], tracks.id[inside], influence[inside])

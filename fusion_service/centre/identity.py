@@ -62,7 +62,7 @@ class Identities:
         self.identity, self.kind = (_inherited(one, heirs) for one in (self.identity, self.kind))
         tracks = rows.tracks
         says = (tracks.identity != NONE) | (tracks.kind != NONE)
-        new = np.flatnonzero(says & (tracks.link != NO_TRACK) & (tracks.updated > tracks.told))
+        new = np.flatnonzero(says & (tracks.link != NO_TRACK) & ~tracks.outside & (tracks.updated > tracks.told))
         new = new[np.isin(tracks.link[new], ids)]
         if len(new):
             self._hear(rows, new)
@@ -148,6 +148,25 @@ class Identities:
         other = (best[0][at] != code[said]) & (best[1][at] >= TRUSTED)
         forbidden[said] = other & (trust >= TRUSTED)
         return Terms(ratio, forbidden)
+
+    def contradicted(self, rows: Rows, linked: Ints, sure: Ints) -> Ints:
+        """Of the linked rows those that are trusted to be another object than a row of the same track, which stays:
+        one of `sure`, else one that says what the track is believed to be, else the one that was linked first."""
+        tracks, trust = rows.tracks, self._stated("identity_trust", rows.source[linked])
+        said = linked[(tracks.identity[linked] != NONE) & (trust >= TRUSTED)]
+        code, link = tracks.identity[said], tracks.link[said]
+        if not len(said):
+            return said
+        question = self._intake.said.identity.schemes()[code]
+        at, best = self.identity.find(link, question), self.identity.best(OPEN)
+        known = at >= 0
+        unbelieved = np.ones(len(said), dtype=np.bool_)
+        unbelieved[known] = (best[0][at[known]] != code[known]) | (best[1][at[known]] < TRUSTED)
+        order = np.lexsort((said, tracks.since[said], unbelieved, ~np.isin(said, sure), question, link))
+        new = np.append(True, (np.diff(link[order]) != 0) | (np.diff(question[order]) != 0))
+        stays = code[order][new][np.cumsum(new) - 1]
+        odd: Ints = np.sort(said[order][code[order] != stays])
+        return odd
 
     def row_terms(self, rows: Rows, i: Ints, j: Ints) -> Terms:
         """For pairs of rows (i, j), each (P,)."""

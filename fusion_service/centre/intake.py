@@ -9,7 +9,6 @@ An intensity stands in its source's table as a complete scan: a track per compon
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from dataclasses import dataclass, replace
 from itertools import groupby
@@ -18,10 +17,16 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre import notes
 from fusion_service.centre.clock import horizon
+from fusion_service.centre.declared import declared_by, loosened, pace_of, sensor_of
+from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
+from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
+from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.orders import Orders
-from fusion_service.centre.sources import Source, Tracks, empty_tracks, message_tracks
+from fusion_service.centre.scans import Scan, as_tracks, fits, is_sound, message_tracks, size_of
+from fusion_service.centre.sources import Source, Tracks, empty_tracks
 from fusion_service.centre.words import Lexicon, Words
 from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.geodesy import FrameError
@@ -40,7 +45,7 @@ from schemas import (
     digest,
 )
 
-__all__ = ["Event", "Intake", "Refused", "SourceFound", "SourceLost"]
+__all__ = ["MAX_TOTAL", "Event", "Intake", "Refused", "SourceFound", "SourceLost"]
 
 MAX_SOURCES = 1000
 MAX_TRACKS = 20_000
@@ -50,9 +55,6 @@ MAX_COMPONENTS = 500_000
 MAX_EVENTS = 10_000
 MAX_ORDERS = 1000
 """Orders of one step."""
-MAX_PERIOD = 1e5
-MAX_WEIGHT = 1e3
-"""Expected number in one component of an intensity."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +81,10 @@ class Refused:
     dropped: bool = False
 
 
-Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused
+Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused | ClockSet | NewEra
 _Queued: TypeAlias = tuple[Message, int]
-_Scan: TypeAlias = LocalTracks | LocalIntensity
 _Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]
+_Checked: TypeAlias = tuple[tuple[Source, LocalTracks, Entry], NDArray[np.uint8]]
 
 
 class Intake:
@@ -91,6 +93,8 @@ class Intake:
     def __init__(self, config: CentreConfig) -> None:
         self.config = config
         self.frame: Frame | None = config.frame
+        self.voting = FrameVoting()
+        self.reframed = False
         self.sources: dict[str, Source] = {}
         self._queue: list[_Queued] = []
         self._held: Counter[str] = Counter()
@@ -103,8 +107,8 @@ class Intake:
         self._dead: list[str] | None = None
 
     def put(self, event: Event, received: int) -> None:
-        """Queue an event; messages beyond `max_pending` of one source, or `MAX_QUEUED` or `MAX_COMPONENTS` of
-        all together, are dropped and counted."""
+        """Queue an event, but not one of the clock; messages beyond `max_pending` of one source, or `MAX_QUEUED` or
+        `MAX_COMPONENTS` of all together, are dropped and counted."""
         if isinstance(event, (SourceFound, SourceLost)):
             if event.source in self._present or len(self._present) < 2 * MAX_SOURCES:
                 self._present[event.source] = isinstance(event, SourceFound)
@@ -113,15 +117,17 @@ class Intake:
                 self._given.append(event)
         elif isinstance(event, Refused):
             self._count(event.source, event.reason, max(event.count, 1), event.dropped)
+        elif isinstance(event, (ClockSet, NewEra)):
+            return
         elif self._is_full(event):
             self._count(event.source, "pending", 1, dropped=True)
         else:
             self._queue.append((event, received))
             self._held[event.source] += 1
-            self._components += _size(event)
+            self._components += size_of(event)
 
     def _is_full(self, message: Message) -> bool:
-        full = len(self._queue) >= MAX_QUEUED or self._components + _size(message) > MAX_COMPONENTS
+        full = len(self._queue) >= MAX_QUEUED or self._components + size_of(message) > MAX_COMPONENTS
         return full or self._held[message.source] >= self.config.max_pending
 
     def _count(self, source: str, reason: str, count: int, dropped: bool) -> None:
@@ -152,20 +158,35 @@ class Intake:
 
     def declared(self, source: Source) -> SourceConfig:
         """What holds for a source: its own word, else the config's; with `override` the other way round."""
-        said = self.config.source(source.name)
-        if source.info is None or said.override:
-            return said
-        info = source.info
-        return replace(said, period=info.period, motion=info.motion, may_start=info.may_start)
+        return declared_by(self.config.source(source.name), source.info)
+
+    def sensor(self, source: Source) -> SensorInfo | None:
+        """Its info with coverage, detection probability and initiation delay as declared; None while it has none."""
+        return sensor_of(self.declared(source), source.info)
+
+    def pace(self, source: Source, complete: bool) -> Pace:
+        """Bounds of the intervals of its tracks, that come in a complete scan or not."""
+        said = self.declared(source)
+        known = source.info is not None or source.name in self.config.sources or said.period != SourceConfig().period
+        return pace_of(said, not known, source.interval if complete else -1, self.config)
 
     def ready(self, source: Source) -> bool:
         """Whether its tracks may be used: it has said what it is, or had a step's time to do so."""
         return source.info is not None or source.waited > 0 or self.config.source(source.name).override
 
     def is_stale(self, source: Source, time: int) -> bool:
-        """Whether it has been silent for `stale_periods` of its own periods."""
-        silence = self.config.stale_periods * self.declared(source).period * 1e9
-        return source.last < 0 or time - source.last > silence
+        """Whether it has been silent for `stale_periods` of its own periods, measured or declared, and `lateness`."""
+        return source.last < 0 or time - source.last > self._silence(source)
+
+    def _silence(self, source: Source) -> int:
+        interval = np.array([self.pace(source, complete=True).first])
+        return int(silence(interval, self.declared(source), self.config)[0])
+
+    def rebase(self, time: int, now: int) -> None:
+        """A new era begins at `time`, ns: nothing that is known is later, nor did it come after `now`."""
+        rebase_sources(self.sources.values(), time)
+        self.voting.asked = min(self.voting.asked, time)
+        self._queue = [(event, min(received, now)) for event, received in self._queue]
 
     def take_orders(self) -> list[Order]:
         """The orders given since the last step, which are obeyed before anything else of it."""
@@ -186,7 +207,7 @@ class Intake:
         self._dead = None
         for source in self.sources.values():
             source.waited += len(source.tracks.id) > 0 and source.info is None
-            source.scans = 0
+            source.scans, source.ahead, source.arrived = 0, -1, []
         for name, found in sorted(self._present.items()):
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):
@@ -204,8 +225,11 @@ class Intake:
             )
             if later:
                 self._held[event.source] += 1
-                self._components += _size(event)
+                self._components += size_of(event)
                 self._queue.append((event, received))
+                if event.source in self.sources:
+                    source = self.sources[event.source]
+                    source.ahead = max(source.ahead, getattr(event, "time", -1))
                 continue
             try:
                 key = (event.source, event.epoch, event.seq, event.type, digest(event), received)
@@ -248,7 +272,7 @@ class Intake:
         return self.sources[name]
 
     def _accept(self, messages: list[_Keyed], time: int, last: int, journal: Journal) -> None:
-        tracks: list[tuple[Source, _Scan, Entry]] = []
+        tracks: list[tuple[Source, Scan, Entry]] = []
         for (name, epoch, seq, kind, code, received), message in messages:
             entry = Entry(name, epoch, seq, code)
             known = self.sources.get(name)
@@ -256,8 +280,9 @@ class Intake:
             source = None if reason else known or self.admitted(name)
             if source is None:
                 journal.refuse(replace(entry, reason=reason or "too-many-sources"))
-                if known is not None and reason == "repeat":
-                    known.repeats += 1
+                if known is not None:
+                    known.repeats += reason == "repeat"
+                    known.why = notes.refusal(reason, message, last, received, self.config) or known.why
                 continue
             if epoch != source.epoch:
                 if source.epoch >= 0:
@@ -270,10 +295,10 @@ class Intake:
             if isinstance(message, SensorInfo):
                 if source.info is None or seq > source.info.seq:
                     source.info = message
-            elif isinstance(message, _Scan):
+            elif isinstance(message, Scan):
                 source.offset = received - message.time
                 tracks.append((source, message, entry))
-        self._apply(tracks, journal)
+        self._apply(tracks, time, journal)
 
     def _fault(self, source: Source, message: Message, code: int, time: int, last: int, received: int) -> str:
         if not isinstance(message, (LocalTracks, LocalIntensity, SensorInfo)):
@@ -285,28 +310,55 @@ class Intake:
         if self.config.name in (message.lineage or ()) or message.source == self.config.name:
             return "loop"
         holds = getattr(message, "time", -1)
-        if max(message.epoch, holds) > horizon(received, self.config):
+        started = -1 if message.epoch == source.epoch else message.epoch
+        if max(started, holds) > horizon(received, self.config):
             return "future"
         if message.epoch < source.epoch and not self.is_stale(source, time):
             return "old-epoch"
         if message.epoch == source.epoch and source.is_repeat(message.type, message.seq, code):
             return "repeat"
         if isinstance(message, SensorInfo):
-            return "" if _sound(message) else "bad-info"
+            return "" if is_sound(message) else "bad-info"
         if last >= 0 and holds < last - round(self.config.lateness * 1e9):
             return "late"
         if not set(self.config.space) <= set(message.space):
             return "space"
         if isinstance(message, LocalIntensity) is not (self.config.kind == "intensity"):
             return "intensity" if isinstance(message, LocalIntensity) else "tracks"
-        return "" if _fits(message) else "length"
+        return "" if fits(message) else "length"
 
-    def _apply(self, items: list[tuple[Source, _Scan, Entry]], journal: Journal) -> None:
+    def _settle_frame(self, checked: list[_Checked], time: int, journal: Journal) -> None:
+        """Let the sources that speak vote on the frame of the picture (see `frames`)."""
+        for (source, message, _), faults in checked:
+            if (faults == 0).any():
+                source.vote = Vote(message.frame, message.space, time)
+        if self.config.frame is not None:
+            return
+        votes = {
+            source.name: source.vote
+            for source in self.sources.values()
+            if source.vote is not None
+            and source.alive is not False
+            and not source.muted
+            and time - source.vote.time <= self._silence(source)
+        }
+        frame = self.voting.settle(votes, self.frame, self.config, time)
+        if frame is None:
+            return
+        if self.frame is not None:
+            self.reframed = True
+            for source in self.sources.values():
+                source.tracks = empty_tracks(len(source.space))
+        self.frame = frame
+        journal.event({"kind": "frame", "source": min(name for name, vote in votes.items() if vote.frame == frame)})
+
+    def _apply(self, items: list[tuple[Source, Scan, Entry]], time: int, journal: Journal) -> None:
         codes = check_numbers([item[1] for item in items])
         checked = [
-            ((source, _as_tracks(message, faults), entry), faults)
+            ((source, as_tracks(message, faults), entry), faults)
             for (source, message, entry), faults in zip(items, codes, strict=True)
         ]
+        self._settle_frame(checked, time, journal)
         for _, run in groupby(enumerate(checked), key=_run_key):
             batch = [item for _, item in run]
             source, first, _ = batch[0][0]
@@ -314,21 +366,23 @@ class Intake:
                 for code in np.unique(faults[faults > 0]).tolist():
                     journal.refuse(replace(entry, reason=FAULTS[code], count=int((faults == code).sum())))
             sound = [faults == 0 for _, faults in batch]
-            if self.frame is None:
-                if not any(mask.any() for mask in sound):
-                    continue
-                self.frame = first.frame
-                journal.event({"kind": "frame", "source": source.name})
             messages = [message for (_, message, _), _ in batch]
+            if self.frame is None and may_be_picture(first.frame, self.config.space):
+                source.leave("frame", sum(int(mask.sum()) for mask in sound))
+                source.why = notes.frame_waiting(name_frame(first.frame))
+                continue
+            said = self.declared(source)
             try:
-                new = message_tracks(
-                    messages, sound, self.frame, self.declared(source).height, self.config.max_components, self.said
-                )
-            except FrameError:
-                reason = "frame"
+                if self.frame is None:
+                    raise FrameError(notes.unfit(name_frame(first.frame), self.config.space))
+                new = message_tracks(messages, sound, self.frame, said.height, self.config.max_components, self.said)
+                new = loosened(new, first.space, said)
+            except FrameError as error:
+                reason, source.why = "frame", notes.frame_refused(str(error))
             else:
                 room = MAX_TOTAL - sum(len(other.tracks.id) for other in self.sources.values() if other is not source)
-                reason = "" if source.apply(messages, new, min(room, MAX_TRACKS)) else "too-many-tracks"
+                pace = self.pace(source, first.complete)
+                reason = "" if source.apply(messages, new, min(room, MAX_TRACKS), pace) else "too-many-tracks"
             if reason:
                 for (_, message, entry), _ in batch:
                     journal.refuse(replace(entry, reason=reason, count=len(message.ids)))
@@ -339,58 +393,3 @@ def _run_key(item: tuple[int, tuple[tuple[Source, LocalTracks, Entry], object]])
     place, ((source, message, _), _) = item
     alone = place if message.complete else -1
     return source.name, alone, message.space, message.frame, message.height
-
-
-def _size(message: Message) -> int:
-    return len(message.means) if isinstance(message, (LocalTracks, LocalIntensity)) else 1
-
-
-def _as_tracks(message: _Scan, faults: NDArray[np.uint8]) -> LocalTracks:
-    """An intensity as a complete scan whose ids no other message has; one without a sound component says nothing.
-    A weight above `MAX_WEIGHT` is marked in `faults`."""
-    if isinstance(message, LocalTracks):
-        return message
-    faults[(faults == 0) & (message.weights > MAX_WEIGHT)] = FAULTS.index("weights")
-    header = {one: getattr(message, one) for one in ("source", "epoch", "seq", "sent", "origin", "lineage")}
-    return LocalTracks(
-        **header,
-        time=message.time,
-        complete=not len(faults) or bool((faults == 0).any()),
-        space=message.space,
-        frame=message.frame,
-        height=message.height,
-        ids=np.arange(len(faults), dtype=np.uint64) + np.uint64((message.seq % 2**44) << 20),
-        existence=message.weights,
-        means=message.means,
-        covariances=message.covariances,
-    )
-
-
-def _fits(message: _Scan) -> bool:
-    """Whether the arrays of a message that was never encoded belong together."""
-    n = len(message.space)
-    if isinstance(message, LocalIntensity):
-        total = len(message.weights)
-        return message.means.shape == (total, n) and message.covariances.shape == (total, n, n)
-    tracks = len(message.ids)
-    total = tracks if message.counts is None else int(np.sum(message.counts))
-    texts = [*(message.identity or ()), *(message.kind or ())]
-    lengths = (message.existence, message.updated, message.counts, message.identity, message.kind, message.kind_p)
-    return (
-        message.means.shape == (total, n)
-        and message.covariances.shape == (total, n, n)
-        and all(column is None or len(column) == tracks for column in lengths)
-        and (message.weights is None or len(message.weights) == total)
-        and {*map(type, texts)} <= {str, type(None)}
-    )
-
-
-def _sound(info: SensorInfo) -> bool:
-    p, covariance = info.detection_probability, info.position_covariance
-    return (
-        0 < info.period <= MAX_PERIOD
-        and 0 <= info.initiation_delay <= MAX_PERIOD
-        and (p is None or 0 <= p <= 1)
-        and all(math.isfinite(part) for part in info.position)
-        and (covariance is None or bool(np.isfinite(covariance).all()))
-    )

@@ -86,17 +86,24 @@ class Journal:
         self._dropped.append(entry)
 
     def decide(
-        self, kind: int, rows: Rows, at: NDArray[np.intp], tracks: NDArray[np.uint64], value: NDArray[np.float64]
+        self,
+        kind: int,
+        rows: Rows,
+        at: NDArray[np.intp],
+        tracks: NDArray[np.uint64],
+        value: NDArray[np.float64],
+        other: NDArray[np.uint64] | None = None,
     ) -> None:
-        """One decision for each of the local tracks `at`, about the global ids `tracks`."""
+        """One decision for each of the local tracks `at`, about the global ids `tracks` (and `other`)."""
         if len(at):
             ids = rows.tracks.id[at]
-            self._column(kind, tracks, rows.source[at], rows.epoch[at], ids, np.zeros_like(ids), value)
+            others = np.zeros_like(ids) if other is None else other
+            self._column(kind, tracks, rows.source[at], rows.epoch[at], ids, others, value)
 
     def broke(self, rows: Rows, at: NDArray[np.intp], tracks: NDArray[np.uint64], value: NDArray[np.float64]) -> None:
         """The links of the local tracks `at` to the global ids `tracks` are broken."""
         self.decide(messages.BROKEN, rows, at, tracks, value)
-        self.broken = dict(zip(at.tolist(), tracks.tolist(), strict=True))
+        self.broken |= dict(zip(at.tolist(), tracks.tolist(), strict=True))
 
     def tracks(self, kind: int, tracks: NDArray[np.uint64], other: NDArray[np.uint64] | None = None) -> None:
         """One decision for each of the global ids `tracks`."""

@@ -59,6 +59,10 @@ class Labels:
             self.twice.follow(picture, said, trusted, meets, self._places, time, journal)
         self.identities.compact()
 
+    def rebase(self, time: int) -> None:
+        """A new era begins at `time`, ns: nothing that is known is later."""
+        self.twice.rebase(time)
+
     def columns(self, ids: Ids, origin: str) -> dict[str, Any]:
         """The optional columns of `GlobalTracks` for the tracks of the last step; None where they say nothing. origin:
         of the message."""
@@ -66,7 +70,8 @@ class Labels:
         kind, kind_p = self.identities.classed(ids)
         said, marks = self._intake.said, self._marks(ids)
         number, callsign = self._called(ids)
-        own = self.compartments.origin
+        # an intensity is of all sources, and so are its tracks
+        own = self.compartments.origin if self._intake.config.kind == "tracks" else np.zeros(0, dtype=np.uint8)
         return {
             **_if((identity != NONE).any(), identity=said.identity.said(identity), identity_p=identity_p),
             **_if((kind != NONE).any(), kind=said.kind.said(kind), kind_p=kind_p),

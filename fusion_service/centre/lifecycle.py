@@ -1,9 +1,12 @@
-"""Life of global tracks: tentative, confirmed, coasting, deleted.
+"""Life of global tracks by data: tentative, confirmed, coasting, deleted.
 
-A track is confirmed by new data in M of its last N chances, or at once by several sources in one step; a
-confirmed track without support coasts on its own motion and is deleted when that lasts too long; a tentative
-one is deleted sooner. One whose existence falls below `min_existence` is tentative again, and deleted if it
-has no support. A chance is a step with new data in it, or without any support.
+A hit is a new measurement in a local track that is fused in the global one (a local track that its tracker only
+predicts on, its `updated` standing still, gives none). A track is confirmed by hits in M of the last N reports that
+were due, at the pace of its own sources, or at once by several sources. It coasts when the next report of every
+contributor is overdue, and ends after `coast` seconds or `coast_periods` of the slowest contributor, whichever is
+longer; a tentative one when N reports were due without a hit. One whose existence falls below `min_existence` is
+tentative again, and ends when overdue. One whose local tracks its sources have all dropped is overdue since its last
+hit. How often the centre steps changes nothing of this.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
-__all__ = ["Picture", "advance", "empty_picture", "newborn"]
+__all__ = ["Picture", "Support", "advance", "empty_picture", "newborn"]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -28,8 +31,9 @@ class Picture:
 
     log_weight (C, G), part_mean (n, C, G), part_covariance (n, n, C, G): components as in `sources.Tracks`.
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
-    seen i64 time of the newest local track in it; born i64 of its first step; supported i64 of the last step
-    with a linked track; hits u64, the last chances as bits; existence.
+    seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
+    overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
+    existence, and opinion and evidence, the log-odds it is made of.
     """
 
     id: NDArray[np.uint64]
@@ -43,9 +47,13 @@ class Picture:
     updated: NDArray[np.int64]
     seen: NDArray[np.int64]
     born: NDArray[np.int64]
-    supported: NDArray[np.int64]
+    due: NDArray[np.int64]
+    interval: NDArray[np.int64]
     hits: NDArray[np.uint64]
+    last_hit: NDArray[np.int64]
     existence: NDArray[np.float64]
+    opinion: NDArray[np.float64]
+    evidence: NDArray[np.float64]
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
@@ -86,31 +94,62 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
         updated=never,
         seen=never,
         born=np.full(count, time, dtype=np.int64),
-        supported=np.full(count, time, dtype=np.int64),
+        due=np.full(count, time, dtype=np.int64),
+        interval=np.zeros(count, dtype=np.int64),
         hits=np.zeros(count, dtype=np.uint64),
+        last_hit=never,
         existence=np.ones(count),
+        opinion=np.zeros(count),
+        evidence=np.zeros(count),
     )
 
 
-def advance(
-    picture: Picture, time: int, support: NDArray[np.intp], fresh: NDArray[np.bool_], config: CentreConfig
-) -> tuple[Picture, NDArray[np.bool_]]:
-    """One step of every life. support (G,): how many sources feed the track; fresh (G,): with new data.
+@dataclass(frozen=True, slots=True, eq=False)
+class Support:
+    """What feeds G global tracks in a step. sources (G,): how many sources whose next report is not overdue; hit (G,):
+    whether a new measurement came in; due (G,): ns at which the next report of the last of them is overdue, -1 where
+    none is believed; interval (G,): ns between reports of the slowest of them; dropped (G,): no local track is linked
+    any more: what it was made of is gone from its sources' scans."""
 
-    Returns the picture with new status, and which tracks end now.
-    """
-    supported = support > 0
-    chance = fresh | ~supported
-    window = np.uint64(2**config.confirm_within - 1)
-    shifted = ((picture.hits << np.uint64(1)) | fresh.astype(np.uint64)) & window
-    hits = np.where(chance, shifted, picture.hits)
-    proven = (np.bitwise_count(hits) >= config.confirm_hits) | (support >= config.confirm_sources)
+    sources: NDArray[np.intp]
+    hit: NDArray[np.bool_]
+    due: NDArray[np.int64]
+    interval: NDArray[np.int64]
+    dropped: NDArray[np.bool_]
+
+
+def advance(picture: Picture, time: int, support: Support, config: CentreConfig) -> tuple[Picture, NDArray[np.bool_]]:
+    """Every life at the step at `time`, ns: the picture with new status, and which tracks end now."""
+    linked = support.due >= 0
+    due = np.where(linked, support.due, picture.due)
+    due = np.where(support.dropped, np.minimum(due, picture.last_hit), due)
+    interval = np.where(linked, support.interval, picture.interval)
+    hits, last = _counted(picture, time, support, interval, config)
+    overdue = time > due
+    proven = (np.bitwise_count(hits) >= config.confirm_hits) | (support.sources >= config.confirm_sources)
     weak = picture.existence < config.min_existence
-    confirm = supported & ~weak & proven & (picture.existence >= config.confirm_existence)
-    status = np.where((picture.status == TENTATIVE) & ~confirm, TENTATIVE, np.where(supported, CONFIRMED, COASTING))
+    confirm = ~overdue & ~weak & proven & (picture.existence >= config.confirm_existence)
+    confirm &= support.sources >= config.min_sources
+    status = np.where((picture.status == TENTATIVE) & ~confirm, TENTATIVE, np.where(overdue, COASTING, CONFIRMED))
     status = np.where(weak, TENTATIVE, status)
-    last = np.where(supported, time, picture.supported)
-    overdue = time - last > round(config.coast * 1e9)
-    hopeless = (status == TENTATIVE) & ~supported & (hits == 0)
-    ended = ~supported & (overdue | hopeless | weak)
-    return replace(picture, status=status.astype(np.uint8), hits=hits, supported=last), ended
+    coast = np.maximum(round(config.coast * 1e9), _times(interval, config.coast_periods))
+    waiting = _times(interval, max(config.confirm_within - 1.5, 0.0))
+    ended = overdue & ((time - due > np.where(status == TENTATIVE, waiting, coast)) | weak)
+    status = status.astype(np.uint8)
+    return replace(picture, status=status, hits=hits, last_hit=last, due=due, interval=interval), ended
+
+
+def _counted(
+    picture: Picture, time: int, support: Support, interval: NDArray[np.int64], config: CentreConfig
+) -> tuple[NDArray[np.uint64], NDArray[np.int64]]:
+    """The window of hits, moved on by as many reports as were due since the last hit, and the step of that."""
+    pace = np.maximum(interval, round(config.period * 1e9))
+    since = np.where(picture.last_hit >= 0, time - picture.last_hit, pace)
+    shift = np.clip((since + pace // 2) // pace, 1, 63).astype(np.uint64)
+    window = np.uint64(2**config.confirm_within - 1)
+    hits = np.where(support.hit, ((picture.hits << shift) | np.uint64(1)) & window, picture.hits)
+    return hits, np.where(support.hit, time, picture.last_hit)
+
+
+def _times(interval: NDArray[np.int64], factor: float) -> NDArray[np.int64]:
+    return np.asarray(np.rint(interval * factor), dtype=np.int64)

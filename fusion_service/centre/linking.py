@@ -1,232 +1,352 @@
-"""Which local track belongs to which global track: keep, break, link, start, merge and split, on evidence."""
+"""Which local track belongs to which global track: judge, exchange, join, begin and merge, on evidence.
+
+A standing link is a prior, not a lock. In every step the rows with new data are judged against the prediction and the
+other sources (`gating`); then, source by source, the rows that have lost their place, are new, or have a rival link
+that has gathered evidence are given to the global tracks by the optimal assignment within each connected cluster, at
+most one of a source to a track; what is left begins tracks of its own, or is held as the shadow of a track that its
+source already follows; and global tracks that no source tells apart are merged when the evidence says that they are
+one.
+"""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from fusion_service.centre.association import (
-    by_size,
-    candidate_pairs,
-    cluster,
-    leave_one_out,
-    overlap,
-    pair_distance,
-    uniform_ci,
-)
+from fusion_service import linalg
+from fusion_service.centre.births import group
+from fusion_service.centre.candidates import Candidates, Pairs, find_candidates
+from fusion_service.centre.evidence import LOW, PairEvidence, RivalLinks, Tests
+from fusion_service.centre.gating import Judgement, Settings, judge
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import set_links
 from fusion_service.config import CentreConfig
-from fusion_service.densities import Mixtures
+from fusion_service.metrics import assign_near
 from schemas import Entry, messages
 
 __all__ = ["Linker"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
+Bools = NDArray[np.bool_]
 MOST_BYTES = 12_000_000
 """Global tracks are not started beyond what one message can carry with room to spare."""
-Agreement = tuple[int, int, float]
-"""Two global ids and their d2."""
+STANDING = 1000.0
+"""What a row that is believed in its track is worth there: nothing but an exchange can take it away."""
+MOST_RIVAL = 50.0
+MEMORY = 0.75
+"""Of the sum of a rival, kept at each new datum: a filter's newest state holds most of what its earlier ones said."""
 
 
 class Linker:
-    """The decisions about links, and the evidence gathered over steps.
-
-    agreeing: pairs of global ids, and for how many steps in a row they have agreed.
-    """
+    """The decisions about links, and the evidence gathered over steps: `merges` and `rivals`."""
 
     def __init__(self, config: CentreConfig, ids: Ids) -> None:
         self.config = config
+        self.tests = Tests.of(config)
+        self.merges = PairEvidence()
+        self.rivals = RivalLinks()
         self._ids = ids
-        self.agreeing: dict[tuple[int, int], int] = {}
-        gates = chi2.ppf([config.gate, config.keep_gate], len(config.space))
-        self._gate, self._keep_gate = float(gates[0]), float(gates[1])
+        self._settings = Settings(self.tests, config.space, config.manoeuvre)
         n = len(config.space)
         self._most = MOST_BYTES // (8 * (n + n * (n + 1) // 2) + 200)
         self._places = [config.space.index(axis) for axis in ("x", "y", "z") if axis in config.space]
 
-    def check(self, rows: Rows, journal: Journal) -> None:
-        """Keep a standing link while its track agrees with the fusion of the others; break it on evidence."""
-        tracks, linked = rows.tracks, rows.linked()
-        if not len(linked):
-            return
-        links = tracks.link[linked]
-        distance = leave_one_out(links, tracks.mean[:, linked], tracks.covariance[:, :, linked])
-        failed = distance > self._keep_gate
-        tracks.fails[linked] = np.where(failed, tracks.fails[linked] + 1, 0)
-        journal.decide(messages.GATE_FAILED, rows, linked[failed], links[failed], distance[failed])
-        ripe = np.flatnonzero(tracks.fails[linked] >= self.config.break_after)
-        if len(ripe):
-            # of one global track only the worst leaves at a time: farthest, then youngest, then last in order
-            order = np.lexsort((-ripe, -tracks.since[linked[ripe]], -distance[ripe], links[ripe]))
-            first = np.append(True, links[ripe][order][1:] != links[ripe][order][:-1])
-            worst = ripe[order][first]
-            journal.broke(rows, linked[worst], links[worst], distance[worst])
-            tracks.link[linked[worst]] = NO_TRACK
-            tracks.fails[linked] = np.where(np.isin(links, links[worst]), 0, tracks.fails[linked])
-        stays = (tracks.link[linked] != NO_TRACK) & ~failed
-        journal.decide(messages.KEPT, rows, linked[stays], links[stays], distance[stays])
-
     def link(
         self, rows: Rows, picture: Picture, now: Picture, meeting: Meeting, step: int, time: int, journal: Journal
-    ) -> tuple[Picture, list[Agreement]]:
-        """Link free tracks to global tracks or to each other, and start new ones.
+    ) -> tuple[Picture, dict[int, int]]:
+        """Decide all links of the step, writing the rows' columns. now: the picture predicted to `time`, ns; meeting:
+        who may meet whom in it.
 
-        now: the picture predicted to `time`; where local tracks stand in a global track their fusion takes its
-        place. Returns the picture with its new tracks, and the pairs of global tracks that agree and share no
-        source.
+        Returns the picture with its new tracks, and the merges: {id that ends: older id that goes on}.
         """
-        mean, covariance, masks, bits = self._nodes(rows, picture, now.mean, now.covariance)
-        free = np.flatnonzero((rows.tracks.link == NO_TRACK) & ~meeting.held)
-        known = np.flatnonzero(picture.time >= 0)
-        count = len(known)
-        mean = np.concatenate([mean[:, known], rows.tracks.mean[:, free]], axis=1)
-        covariance = np.concatenate([covariance[:, :, known], rows.tracks.covariance[:, :, free]], axis=2)
-        masks = np.concatenate([masks[known], bits[free]])
-        source = np.concatenate([np.full(count, -1), rows.source[free]])
-        parts = _components(now, known, rows, free)
-        i, j, distance, spread = self._gated(mean, covariance, masks, source, parts)
-        i, j, distance, spread = _meeting(meeting, i, j, distance, spread, known, free)
-        both = j < count
-        agreements = [
-            (int(picture.id[known[a]]), int(picture.id[known[b]]), float(d))
-            for a, b, d in zip(i[both], j[both], distance[both], strict=True)
-        ]
-        if len(free):
-            nodes = np.arange(len(source))
-            root = np.array(cluster(i[~both], j[~both], (distance + spread)[~both], masks, nodes < count)[0])
-            key, wanted = i * len(nodes) + j, (root * len(nodes) + nodes)[count:]
-            at = np.minimum(np.searchsorted(key, wanted), max(len(key) - 1, 0))
-            to_root = np.full(len(free), np.nan)
-            if len(key):
-                to_root = np.where(key[at] == wanted, distance[at], np.nan)
-            picture = self._settle(rows, free, picture, known, root, to_root, step, time, journal)
-        return picture, agreements
+        meeting.settle(step, journal)
+        judged = judge(rows, now, meeting.forced_row, time, self._settings, journal)
+        near = find_candidates(rows, now, meeting, judged, self.tests.gate, self._places)
+        near = _without_broken(near, rows, now, judged)
+        joined = self._assign(rows, now, _vacant(near, meeting), step, journal)
+        merged = self._merge(rows, now, near, step, journal)
+        free = near.loose[rows.tracks.link[near.loose] == NO_TRACK]
+        starting = self._shadow(rows, now, near, meeting, free)
+        picture = self._begin(rows, picture, near, judged, free, starting, step, time, journal)
+        newly = np.concatenate([joined, free[rows.tracks.link[free] != NO_TRACK]])
+        rows.tracks.seen[newly], rows.tracks.judged[newly] = time, rows.tracks.updated[newly]
+        waiting = rows.tracks.link[near.loose] == NO_TRACK
+        rows.tracks.judged[near.loose[waiting]] = rows.tracks.updated[near.loose[waiting]]
+        return picture, merged
 
-    def _nodes(
-        self, rows: Rows, picture: Picture, mean: Floats, covariance: Floats
-    ) -> tuple[Floats, Floats, NDArray[Any], NDArray[Any]]:
-        """State of every global track and the sources in it as bits; the bit of every row's source."""
-        tracks, linked = rows.tracks, rows.linked()
-        bits = _bits(rows.source)
-        masks = np.zeros(len(picture.id), dtype=bits.dtype)
-        mean, covariance = mean.copy(), covariance.copy()
-        for ids, members in by_size(tracks.link[linked]):
-            at, chosen = picture.find(ids), linked[members]
-            mean[:, at], covariance[:, :, at] = uniform_ci(
-                np.moveaxis(tracks.mean[:, chosen], 2, 0), np.moveaxis(tracks.covariance[:, :, chosen], 3, 0)
-            )
-            masks[at] = np.bitwise_or.reduce(bits[chosen], axis=1)
-        return mean, covariance, masks, bits
+    def _assign(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> Ints:
+        """Exchange links and let loose rows join, source by source; a track that one source has touched is left to
+        the others until the next step. Returns the rows that joined a track."""
+        sums = self._rival_sums(rows, now, near)
+        weight = self.tests.weight(rows.tracks.data)
+        touched = np.zeros(len(now.id), dtype=np.bool_)
+        joined: list[Ints] = [np.zeros(0, dtype=np.intp)]
+        moved: list[Ints] = [np.zeros(0, dtype=np.intp)]
+        active = near.joins.first, near.rivals.first[sums > weight[near.rivals.first]]
+        for name in np.unique(rows.source[np.concatenate(active)]).tolist():
+            row, track, value, stays = self._options(rows, now, near, sums, weight, name, touched)
+            if not len(row):
+                continue
+            order = np.lexsort((track, row))
+            row, track, value, stays = row[order], track[order], value[order], stays[order]
+            kept = assign_near(row, track, value, (len(rows.source), len(now.id)))
+            mine = np.unique(row)
+            given = np.full(len(rows.source), -1, dtype=np.intp)
+            given[row[kept]] = track[kept]
+            taken = kept[~stays[kept]]
+            lost = mine[(given[mine] < 0) & (rows.tracks.link[mine] != NO_TRACK)]
+            self._apply(rows, now, near, row[taken], track[taken], lost, step, journal)
+            touched[track[taken]] = True
+            joined.append(row[taken])
+            moved.append(row[taken])
+        self._keep_rivals(rows, now, near, sums, np.concatenate(moved))
+        return np.concatenate(joined)
 
-    def _gated(
-        self, mean: Floats, covariance: Floats, masks: NDArray[Any], source: Ints, parts: Mixtures | None
-    ) -> tuple[Ints, Ints, Floats, Floats]:
-        """Pairs i < j within the gate that share no source, in order, with d2 and log det; of mixtures, the d2
-        of their nearest components and what d2 + log det would be for their overlap, less that d2."""
-        sigma = np.sqrt(sum(covariance[place, place] for place in self._places))
-        i, j = candidate_pairs(mean[self._places], sigma, float(np.sqrt(self._gate)), source)
-        disjoint = (masks[i] & masks[j]) == 0
-        i, j = i[disjoint], j[disjoint]
-        distance, spread = pair_distance(mean, covariance, i, j)
-        if parts is not None:
-            several = np.isfinite(parts.log_weights).sum(axis=0) > 1
-            at = np.flatnonzero(several[i] | several[j])
-            distance[at], spread[at] = overlap(parts.take(i[at]), parts.take(j[at]))
-        near = distance <= self._gate
-        return i[near], j[near], distance[near], spread[near]
+    def _rival_sums(self, rows: Rows, now: Picture, near: Candidates) -> Floats:
+        """The sum of every rival pair, this datum's share in it."""
+        rivals = near.rivals
+        if not len(rivals.first):
+            return np.zeros(0)
+        more = 0.5 * (near.own[rivals.first] - (rivals.distance + rivals.spread))
+        more = np.where(np.isfinite(more), more, 0.0)
+        before = self.rivals.sums(rows, now, rivals.first, rivals.second)
+        return np.clip(MEMORY * before + more, -LOW, MOST_RIVAL)
 
-    def _settle(
-        self,
-        rows: Rows,
-        free: Ints,
-        picture: Picture,
-        known: Ints,
-        root: Ints,
-        distance: Floats,
-        step: int,
-        time: int,
+    def _options(
+        self, rows: Rows, now: Picture, near: Candidates, sums: Floats, weight: Floats, name: int, touched: Bools
+    ) -> tuple[Ints, Ints, Floats, Bools]:
+        """Of one source: the possible pairs (row, track), what each is worth, and which of them are as they stand.
+        Only clusters in which something can change."""
+        tracks = rows.tracks
+        some = rows.source[near.joins.first] == name
+        joins = near.joins.take(some)
+        top = joins.spread.max(initial=-np.inf)
+        worth = 1.0 + 0.5 * (self.tests.gate - joins.distance) + 0.5 * (top - joins.spread)
+        mine = rows.source[near.rivals.first] == name
+        rivals, sums = near.rivals.take(mine), sums[mine]
+        believed = np.unique(rivals.first)
+        loose = np.unique(joins.first)
+        standing = np.concatenate([believed, loose[tracks.link[loose] != NO_TRACK], _holders(rows, now, joins, name)])
+        standing = np.unique(standing)
+        at = now.find(tracks.link[standing])
+        stay = np.where(tracks.outside[standing], 0.5, STANDING + weight[standing])
+        row = np.concatenate([joins.first, rivals.first, standing])
+        track = np.concatenate([joins.second, rivals.second, at])
+        value = np.concatenate([worth, STANDING + sums, stay])
+        stays = np.arange(len(row)) >= len(row) - len(standing)
+        free = ~touched[track] | stays
+        held = np.isin(row, standing[touched[at]])
+        free &= ~held & (value > 0)
+        own = tracks.link[row] == now.id[track]
+        free &= stays | ~own
+        row, track, value, stays = row[free], track[free], value[free], stays[free]
+        reason = np.concatenate([loose, rivals.first[sums > weight[rivals.first]]])
+        inside = _in_clusters(row, track, reason, len(rows.source), len(now.id))
+        return row[inside], track[inside], value[inside], stays[inside]
+
+    def _apply(
+        self, rows: Rows, now: Picture, near: Candidates, row: Ints, track: Ints, lost: Ints, step: int,
         journal: Journal,
-    ) -> Picture:
-        """Give every free track of a cluster its global track, a new one where the cluster has none."""
-        tracks, count = rows.tracks, len(known)
-        roots = root[count:]
-        starting = np.unique(roots[(roots >= count) & rows.may_start[free]])
+    ) -> None:  # fmt: skip
+        tracks = rows.tracks
+        if len(lost):
+            journal.broke(rows, lost, tracks.link[lost], np.full(len(lost), np.nan))
+            set_links(tracks, lost, NO_TRACK, step)
+        if not len(row):
+            return
+        before, after = tracks.link[row], now.id[track]
+        distance = _distance_of(near, row, track)
+        changed = before != NO_TRACK
+        journal.decide(messages.EXCHANGED, rows, row[changed], after[changed], distance[changed], before[changed])
+        journal.decide(messages.LINKED, rows, row[~changed], after[~changed], distance[~changed])
+        set_links(tracks, row, after, step)
+
+    def _keep_rivals(self, rows: Rows, now: Picture, near: Candidates, sums: Floats, moved: Ints) -> None:
+        """The sums for the next step; those of a row that has moved are from now on beside its new link."""
+        rivals = near.rivals
+        row, track, value = rivals.first, rivals.second, sums
+        if len(moved) and len(row):
+            link = rows.tracks.link[row]
+            chosen = now.id[track] == link
+            gained = np.zeros(len(rows.source))
+            gained[row[chosen]] = value[chosen]
+            value = np.clip(np.where(np.isin(row, moved), value - gained[row], value), -LOW, MOST_RIVAL)
+            row, track, value = row[~chosen], track[~chosen], value[~chosen]
+        # rows without a new datum keep what they had
+        old_row, old_track, old = self.rivals.known(rows, now)
+        quiet = ~rows.fresh[old_row] & (rows.tracks.link[old_row] != NO_TRACK)
+        row = np.concatenate([row, old_row[quiet]])
+        track = np.concatenate([track, old_track[quiet]])
+        value = np.concatenate([value, old[quiet]])
+        order = np.lexsort((track, row))
+        self.rivals.keep(rows, now, row[order], track[order], value[order])
+
+    def _shadow(self, rows: Rows, now: Picture, near: Candidates, meeting: Meeting, free: Ints) -> Bools:
+        """Hold loose rows whose source already follows the track that they are near; (F,) which may begin one."""
+        tracks, tests = rows.tracks, self.tests
+        joins = near.joins.take(np.isin(near.joins.first, free))
+        holds = _held(rows, now, joins.first, joins.second)
+        joins = joins.take(holds)
+        order = np.lexsort((joins.distance + joins.spread, joins.first))
+        first = np.append(True, np.diff(joins.first[order]) != 0) if len(order) else np.zeros(0, dtype=np.bool_)
+        best = joins.take(order[first])
+        nearest = np.full(len(rows.source), -1, dtype=np.intp)
+        nearest[best.first] = best.second
+        at = now.find(tracks.shadow[free]) if len(now.id) else np.zeros(len(free), dtype=np.intp)
+        at = np.minimum(at, max(len(now.id) - 1, 0))
+        old = (tracks.shadow[free] != NO_TRACK) & (len(now.id) > 0)
+        if old.any():
+            old &= now.id[at] == tracks.shadow[free]
+            old &= _held(rows, now, free, at) & ~meeting.with_tracks(free, at).forbidden
+            spread = tracks.covariance[:, :, free] + near.covariance[:, :, at]
+            distance = linalg.quadratic(spread, tracks.mean[:, free] - near.mean[:, at])
+            more = np.where(old, -np.nan_to_num(tests.sameness(distance), nan=-tests.bound / 2), 0.0)
+            tracks.apart[free] = np.clip(tracks.apart[free] + more, -tests.bound, tests.bound)
+        new = ~old & (nearest[free] >= 0)
+        tracks.shadow[free[~old]] = NO_TRACK
+        tracks.apart[free[~old]] = 0.0
+        if new.any():
+            tracks.shadow[free[new]] = now.id[nearest[free[new]]]
+        return np.asarray((tracks.shadow[free] == NO_TRACK) | (tracks.apart[free] >= tests.bound - 1e-9))
+
+    def _begin(
+        self, rows: Rows, picture: Picture, near: Candidates, judged: Judgement, free: Ints, starting: Bools,
+        step: int, time: int, journal: Journal,
+    ) -> Picture:  # fmt: skip
+        """New tracks for the groups of free rows in which one may start and is nobody's shadow, or two sources agree
+        that there is one more."""
+        tracks = rows.tracks
+        if not len(free):
+            return picture
+        groups = group(free, rows.source, near.births, self.tests.gate)
+        count = int(groups.max(initial=-1)) + 1
+        size = np.bincount(groups, minlength=count)
+        may = np.bincount(groups, rows.may_start[free], minlength=count) > 0
+        may &= (np.bincount(groups, starting & rows.may_start[free], minlength=count) > 0) | (size > 1)
+        chosen = np.flatnonzero(may)
         room = max(0, self._most - len(picture.id))
-        if len(starting) > room:
-            journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(starting) - room))
-            starting = starting[:room]
-        new_ids = self._ids.allot(len(starting))
-        ids = np.zeros(len(root), dtype=np.uint64)
-        ids[:count] = picture.id[known]
-        ids[starting] = new_ids
-        given = ids[roots]
-        takes = given != NO_TRACK
-        tracks.link[free] = given
-        tracks.since[free[takes]] = step
-        tracks.fails[free[takes]] = 0
-        tracks.used[free[takes]] = -1
-        journal.decide(messages.LINKED, rows, free[takes], given[takes], distance[takes])
-        journal.birth(new_ids)
-        born = set(new_ids.tolist())
+        if len(chosen) > room:
+            journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(chosen) - room))
+            chosen = chosen[:room]
+        new = self._ids.allot(len(chosen))
+        given = np.zeros(count, dtype=np.uint64)
+        given[chosen] = new
+        takes = given[groups] != NO_TRACK
+        set_links(tracks, free[takes], given[groups[takes]], step)
+        distance = np.full(len(free), np.nan)
+        journal.decide(messages.LINKED, rows, free[takes], given[groups[takes]], distance[takes])
+        journal.birth(new)
+        born = set(new.tolist())
         for row, old in journal.broken.items():
             link = int(tracks.link[row])
             if link in born:
                 journal.split(link, old)
-        return picture.join(newborn(new_ids, len(self.config.space), time))
+        return picture.join(newborn(new, len(self.config.space), time))
 
-    def merge(self, rows: Rows, agreements: list[Agreement], step: int, journal: Journal) -> dict[int, int]:
-        """Join global tracks that have agreed for several steps in a row: {id that ends: older id that goes on}."""
-        self.agreeing = {(a, b): self.agreeing.get((a, b), 0) + 1 for a, b, _ in agreements}
-        ripe = [(d, a, b) for a, b, d in agreements if self.agreeing[a, b] >= self.config.merge_after]
+    def _merge(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> dict[int, int]:
+        """Join global tracks that share no source and that the evidence says are one: {newer id: older id}."""
+        pairs = near.tracks
+        masks = _masks(rows, now)
+        apart = (masks[pairs.first] & masks[pairs.second]) == 0
+        pairs = pairs.take(apart)
+        self.merges.add(pairs.first, pairs.second, self.tests.sameness(pairs.distance), now, self.tests.bound)
+        far = dict(zip(zip(now.id[pairs.first].tolist(), now.id[pairs.second].tolist(), strict=True),
+                       pairs.distance.tolist(), strict=True))  # fmt: skip
         merged: dict[int, int] = {}
         taken: set[int] = set()
-        for distance, old, new in sorted(ripe):
+        for old, new in self.merges.ripe(self.tests.bound):
             if not taken & {old, new}:
                 taken |= {old, new}
                 merged[new] = old
-                journal.merge(old, new, distance)
-                moved = rows.tracks.link == np.uint64(new)
-                rows.tracks.link[moved] = np.uint64(old)
-                rows.tracks.since[moved] = step
-        self.agreeing = {pair: count for pair, count in self.agreeing.items() if not taken & set(pair)}
+                journal.merge(old, new, far[old, new])
+                moved = np.flatnonzero(rows.tracks.link == np.uint64(new))
+                set_links(rows.tracks, moved, np.uint64(old), step)
+        self.merges.forget(taken)
         return merged
 
+    def packed(self) -> dict[str, Any]:
+        """The evidence as plain values."""
+        return {"merges": self.merges.packed(), "rivals": self.rivals.packed()}
 
-def _meeting(
-    meeting: Meeting, i: Ints, j: Ints, distance: Floats, spread: Floats, known: Ints, free: Ints
-) -> tuple[Ints, Ints, Floats, Floats]:
-    """The pairs that may meet, ranked by what they are said to be too."""
-    count, forbidden, spread = len(known), np.zeros(len(i), dtype=np.bool_), spread.copy()
-    pairs, mixed, ours = i >= count, (i < count) & (j >= count), j < count
-    for mask, terms in (
-        (pairs, meeting.with_rows(free[i[pairs] - count], free[j[pairs] - count])),
-        (mixed, meeting.with_tracks(free[j[mixed] - count], known[i[mixed]])),
-    ):
-        spread[mask] -= 2.0 * terms.ratio
-        forbidden[mask] = terms.forbidden
-    forbidden[ours] = meeting.of_tracks(known[i[ours]], known[j[ours]])
-    return i[~forbidden], j[~forbidden], distance[~forbidden], spread[~forbidden]
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on with what `packed` gave."""
+        self.merges, self.rivals = PairEvidence.unpacked(state["merges"]), RivalLinks.unpacked(state["rivals"])
 
 
-def _components(now: Picture, known: Ints, rows: Rows, free: Ints) -> Mixtures | None:
-    """The densities of the global tracks and the free rows as mixtures, where any of them is one."""
-    if not len(now.log_weight) and not len(rows.tracks.log_weight):
-        return None
-    return Mixtures.joined([now.mixtures(known), rows.tracks.mixtures(free)])
+def _vacant(near: Candidates, meeting: Meeting) -> Candidates:
+    """Without the pairs whose place another row has by order."""
+    joins, rivals = (pairs.take(~meeting.taken(pairs.first, pairs.second)) for pairs in (near.joins, near.rivals))
+    return replace(near, joins=joins, rivals=rivals)
 
 
-def _bits(source: Ints) -> NDArray[Any]:
-    """One bit per source: int64 while they fit, Python integers beyond."""
-    if source.max(initial=0) < 62:
-        return np.left_shift(1, source)
-    wide = np.empty(len(source), dtype=object)
-    wide[:] = [1 << int(index) for index in source]
-    return wide
+def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgement) -> Candidates:
+    """A row does not join again what it was just broken from."""
+    if not len(judged.broken) or not len(near.joins.first):
+        return near
+    was = np.zeros(len(rows.source), dtype=np.uint64)
+    was[judged.broken] = judged.was
+    joins = near.joins.take(was[near.joins.first] != now.id[near.joins.second])
+    return replace(near, joins=joins)
+
+
+def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
+    """Which of the pairs (row, track): the row's source has another, believed row in the track."""
+    inside = rows.inside()
+    width = max(len(now.id), 1)
+    keys = np.unique(rows.source[inside] * width + now.find(rows.tracks.link[inside]))
+    return np.isin(rows.source[row] * width + track, keys)
+
+
+def _holders(rows: Rows, now: Picture, joins: Pairs, name: int) -> Ints:
+    """The rows of the source that stand in a track that a loose row of it may join."""
+    wanted = np.unique(now.id[joins.second])
+    mine = np.flatnonzero((rows.source == name) & (rows.tracks.link != NO_TRACK))
+    return mine[np.isin(rows.tracks.link[mine], wanted)]
+
+
+def _in_clusters(row: Ints, track: Ints, reason: Ints, rows: int, tracks: int) -> Bools:
+    """Which pairs lie in a connected cluster that holds one of the rows `reason`."""
+    if not len(row):
+        return np.zeros(0, dtype=np.bool_)
+    graph = coo_array((np.ones(len(row), dtype=np.int8), (row, rows + track)), (rows + tracks, rows + tracks))
+    part = connected_components(graph, directed=False)[1]
+    return np.isin(part[row], part[reason])
+
+
+def _distance_of(near: Candidates, row: Ints, track: Ints) -> Floats:
+    """d2 (K,) of pairs among the joins and the rivals."""
+    first = np.concatenate([near.joins.first, near.rivals.first])
+    second = np.concatenate([near.joins.second, near.rivals.second])
+    distance = np.concatenate([near.joins.distance, near.rivals.distance])
+    width = int(second.max(initial=0)) + 1
+    keys = first * width + second
+    order = np.argsort(keys, kind="stable")
+    at = np.minimum(np.searchsorted(keys[order], row * width + track), len(keys) - 1)
+    return distance[order[at]]
+
+
+def _masks(rows: Rows, now: Picture) -> NDArray[Any]:
+    """The sources in every global track as bits: int64 while they fit, Python integers beyond."""
+    linked = rows.linked()
+    source, at = rows.source[linked], now.find(rows.tracks.link[linked])
+    there = (
+        (at < len(now.id)) & (now.id[np.minimum(at, max(len(now.id) - 1, 0))] == rows.tracks.link[linked])
+        if len(now.id)
+        else np.zeros(len(linked), dtype=np.bool_)
+    )
+    source, at = source[there], at[there]
+    wide = bool(source.max(initial=0) >= 62)
+    masks = np.zeros(len(now.id), dtype=object if wide else np.int64)
+    bits = np.array([1 << int(one) for one in source.tolist()], dtype=object) if wide else np.left_shift(1, source)
+    np.bitwise_or.at(masks, at, bits)
+    return masks

@@ -14,6 +14,7 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.judging import View, find_local, judge, linked_to
 from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.rows import NO_TRACK
+from fusion_service.centre.sources import relinked
 from fusion_service.order import LocalId, Order, order_event
 
 __all__ = ["Obeyed", "heirs", "obey", "view_of"]
@@ -32,9 +33,12 @@ def view_of(intake: Intake, picture: Picture, time: int) -> View:
     return View(time, picture.id, intake.sources, intake.orders.standing, ignored, intake.config.kind == "intensity")
 
 
-def obey(given: list[Order], intake: Intake, picture: Picture, ids: Ids, journal: Journal, time: int) -> Obeyed:
-    """Let end what no longer stands at `time`, ns, then obey the orders given, in the order of their coming."""
-    hands = _Hands(intake, picture, ids, journal, time)
+def obey(
+    given: list[Order], intake: Intake, picture: Picture, ids: Ids, journal: Journal, time: int, step: int
+) -> Obeyed:
+    """Let end what no longer stands at `time`, ns, of `step`, then obey the orders given, in the order of their
+    coming."""
+    hands = _Hands(intake, picture, ids, journal, time, step)
     for one, why in intake.orders.expire(hands.view()):
         journal.event({"kind": "order_ended", "number": one.order.number, "what": one.order.what, "why": why})
     for order in given:
@@ -50,9 +54,9 @@ def obey(given: list[Order], intake: Intake, picture: Picture, ids: Ids, journal
 class _Hands:
     """Carries out what `judge` has found good: a method an order."""
 
-    def __init__(self, intake: Intake, picture: Picture, ids: Ids, journal: Journal, time: int) -> None:
+    def __init__(self, intake: Intake, picture: Picture, ids: Ids, journal: Journal, time: int, step: int) -> None:
         self.intake, self.picture, self.journal, self.time = intake, picture, journal, time
-        self._ids = ids
+        self._ids, self._step = ids, step
         self.gone: dict[int, int] = {}
 
     def view(self) -> View:
@@ -64,13 +68,8 @@ class _Hands:
     def _set_link(self, local: LocalId, link: int) -> None:
         """A new link, as if just made."""
         source = self.intake.sources[local.source]
-        tracks = source.tracks
-        at = int(np.searchsorted(tracks.id, np.uint64(local.id)))
-        columns = {"link": link, "fails": 0, "used": -1}
-        changed = {name: getattr(tracks, name).copy() for name in columns}
-        for name, value in columns.items():
-            changed[name][at] = value
-        source.tracks = replace(tracks, **changed)
+        at = np.searchsorted(source.tracks.id, np.array([local.id], dtype=np.uint64))
+        source.tracks = relinked(source.tracks, at, np.uint64(link), self._step)
 
     def _relink(self, old: int, new: int) -> None:
         for local in linked_to(self.view(), old):
@@ -159,6 +158,7 @@ class _Hands:
             covariance=source.tracks.covariance[np.ix_(wanted, wanted)][..., at : at + 1],
             time=source.tracks.time[at : at + 1],
             updated=source.tracks.updated[at : at + 1],
+            seen=source.tracks.time[at : at + 1],
         )
         self.picture = self.picture.join(born)
         self._release_forced(local)
@@ -189,8 +189,8 @@ class _Hands:
         tables = [source.tracks.link for name, source in self.intake.sources.items() if name != order.source]
         shared = np.unique(np.concatenate([*tables, np.zeros(0, dtype=np.uint64)]))
         source = self.intake.sources[order.source]
-        both = np.isin(source.tracks.link, shared)
-        source.tracks = replace(source.tracks, link=np.where(both, NO_TRACK, source.tracks.link))
+        both = np.flatnonzero(np.isin(source.tracks.link, shared[shared != NO_TRACK]))
+        source.tracks = relinked(source.tracks, both, NO_TRACK, self._step)
         self._stand(order)
 
     def _release(self, order: Order) -> None:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.labels import Labels
-from fusion_service.centre.lifecycle import Picture, advance
+from fusion_service.centre.lifecycle import Picture, Support, advance
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
 from schemas import ORIGINS, GlobalTracks, Local, messages
@@ -32,16 +32,11 @@ class Contributions:
 
 
 def live_on(
-    picture: Picture,
-    time: int,
-    support: NDArray[np.intp],
-    fresh: NDArray[np.bool_],
-    config: CentreConfig,
-    journal: Journal,
+    picture: Picture, time: int, support: Support, config: CentreConfig, journal: Journal
 ) -> tuple[Picture, NDArray[np.bool_]]:
     """One step of every life, told to the journal: the picture, and which of its tracks (G,) end now."""
     before = picture.status
-    picture, ended = advance(picture, time, support, fresh, config)
+    picture, ended = advance(picture, time, support, config)
     for track in picture.id[ended].tolist():
         journal.end(track, "lost", None)
     for status, decision in ((messages.CONFIRMED, messages.CONFIRMED_NOW), (messages.COASTING, messages.COASTING_NOW)):

@@ -21,15 +21,23 @@ class Rows:
 
     source (M,): index into the sorted names. epoch (M,) u64. tracks: their columns, mean (n, M) and covariance
     (n, n, M) predicted and marginalised to the centre's space; the columns of links may be written. may_start
-    (M,). kept: how many of them each source has, in order.
+    (M,). interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. fresh
+    (M,): a measurement is in it that was not judged before. kept: how many of them each source has, in order.
     """
 
     source: NDArray[np.intp]
     epoch: NDArray[np.uint64]
     tracks: Tracks
     may_start: NDArray[np.bool_]
+    interval: NDArray[np.int64]
+    lost: NDArray[np.bool_]
+    fresh: NDArray[np.bool_]
     kept: dict[str, int]
 
     def linked(self) -> NDArray[np.intp]:
         """Rows that belong to a global track."""
         return np.flatnonzero(self.tracks.link != NO_TRACK)
+
+    def inside(self) -> NDArray[np.intp]:
+        """Rows that belong to a global track and are fused in it: their newest datum has passed its gate."""
+        return np.flatnonzero((self.tracks.link != NO_TRACK) & ~self.tracks.outside)

@@ -13,9 +13,14 @@ __all__ = ["step_status"]
 
 
 def step_status(
-    intake: Intake, journal: Journal, log: StepLog, tracks: dict[str, int], refused: dict[str, int]
+    intake: Intake,
+    journal: Journal,
+    log: StepLog,
+    tracks: dict[str, int],
+    refused: dict[str, int],
+    notes: tuple[str, ...] | None = None,
 ) -> Status:
-    """Status after the step of `log`; tracks: how many there are of each kind."""
+    """Status after the step of `log`; tracks: how many there are of each kind; notes: what an operator should know."""
     return Status(
         source=log.source,
         epoch=log.epoch,
@@ -31,6 +36,7 @@ def step_status(
         sources={name: _health(source, intake, journal, log.time) for name, source in sorted(intake.sources.items())},
         tracks=tracks,
         step_time={},
+        notes=notes,
     )
 
 
@@ -47,5 +53,7 @@ def _health(source: Source, intake: Intake, journal: Journal, time: int) -> dict
         "gaps": source.gaps,
         "reordered": source.reordered,
         "tracks": len(source.tracks.id),
+        "unused": dict(sorted(source.unused.items())),
+        "note": source.why,
         "refused": dict(sorted(journal.refused_of.get(source.name, {}).items())),
     }

@@ -1,16 +1,33 @@
-"""Commands that work on recordings, one file each.
+"""The commands of `fusion-service`, one file each.
 
-A command is a module with HELP, EXAMPLE, `add(parser)`, which gives it its arguments, and `run(args, stop)`. What it
-needs that is slow to import it imports when it runs.
+A command is a module with HELP, EXAMPLE, `add(parser)`, which gives it its arguments, and `run(args, stop)`, which
+does it and raises what a person can mend (`fusion_service.errors`). What is slow to import it imports when it runs. A
+command whose `stop` is set leaves its work as it is, says so, and returns: it has done what it was told.
 """
 
 from __future__ import annotations
 
 from types import ModuleType
 
-from fusion_service.commands import evaluate, explain, export, order, repair, replay
+from fusion_service.commands import (
+    check,
+    demo,
+    evaluate,
+    explain,
+    export,
+    hub,
+    order,
+    record,
+    repair,
+    replay,
+    rules,
+    run,
+)
 
 __all__ = ["COMMANDS"]
 
-COMMANDS: tuple[ModuleType, ...] = (order, replay, evaluate, explain, export, repair)
-"""In the order of the help; a command is called as its module, with hyphens."""
+COMMANDS: dict[str, ModuleType] = {
+    module.__name__.rpartition(".")[2]: module
+    for module in (hub, run, order, record, demo, check, rules, replay, evaluate, explain, export, repair)
+}
+"""By name, in the order of the help."""

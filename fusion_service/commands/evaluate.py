@@ -4,18 +4,19 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import threading
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_service.errors import ReviewError
+from fusion_service.process import argument, positive
 from fusion_service.progress import Progress
 
 if TYPE_CHECKING:
     from fusion_service.review.evaluation import Assessment
     from schemas import Truth
+
+__all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "How good the tracks of a mission were: against truth where there is any, and against each other."
 EXAMPLE = (
@@ -28,23 +29,27 @@ SAMPLE = 20_000
 """Tracks of each source on the map, about."""
 
 
-class _StoppedError(Exception):
-    """A signal came."""
-
-
 def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
     parser.add_argument("recordings", metavar="FILE", nargs="+", help="recordings (.rrd)")
     parser.add_argument("--truth", metavar="FILE", help="truth: a recording, or a table as `export` writes it")
     parser.add_argument(
-        "--cutoff", type=_positive, metavar="M", help="largest error that still counts as followed, m (default: chosen)"
+        "--cutoff",
+        type=argument(positive),
+        metavar="M",
+        help="largest error that still counts as followed, m (default: chosen)",
     )
-    parser.add_argument("--every", type=_positive, metavar="S", help="score so often, s (default: at each step)")
+    parser.add_argument(
+        "--every", type=argument(positive), metavar="S", help="score so often, s (default: at each step)"
+    )
     parser.add_argument("--centre", metavar="NAME", action="append", help="only this centre; may be repeated")
     parser.add_argument("--json", metavar="FILE", help="write every number here")
     parser.add_argument("--html", metavar="FILE", help="write a page for people here")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    """Score the recordings. Raises `ReviewError`, OSError."""
+    from fusion_service.errors import ReviewError, Stopped
     from fusion_service.review.evaluation.results import results, text
     from fusion_service.review.evaluation.truth import read_truth
     from fusion_service.review.outputs import check_page
@@ -62,7 +67,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         for path in map(Path, args.recordings):
             cutoff = args.cutoff or (done[0].c if done else None)
             done.append(_assess(path, truths, cutoff, args, stop))
-    except _StoppedError:
+    except Stopped:
         print(f"stopped: {len(done)} of {len(args.recordings)} recordings are scored")
     if not done:
         return
@@ -84,6 +89,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
 
 
 def _need_rerun() -> None:
+    from fusion_service.errors import ReviewError
     from fusion_service.recording.columns import import_rerun
 
     try:
@@ -95,6 +101,7 @@ def _need_rerun() -> None:
 def _assess(
     path: Path, truths: list[Truth], cutoff: float | None, args: argparse.Namespace, stop: threading.Event
 ) -> Assessment:
+    from fusion_service.errors import ReviewError, Stopped
     from fusion_service.review.evaluation import assess
     from fusion_service.review.evaluation.logbook import Logbook
 
@@ -104,7 +111,7 @@ def _assess(
         def showing(begin: float, share: float, scale: float) -> Callable[[float], None]:
             def show(done: float) -> None:
                 if stop.is_set():
-                    raise _StoppedError
+                    raise Stopped
                 bar.show(begin + share * min(done / scale, 1.0))
 
             return show
@@ -125,13 +132,3 @@ def _assess(
             progress=showing(0.3, 0.7, 1.0),
             rows=SAMPLE if args.html else 0,
         )
-
-
-def _positive(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number above 0")
-    return value

@@ -35,16 +35,20 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Run the command."""
-    from fusion_service.errors import ReviewError
+    """Tell what became of a track, or list them. Raises `UsageError`, `ReviewError`."""
+    from fusion_service.errors import Stopped, UsageError
     from fusion_service.review.explain import explanation, listing, read_mission, write_view
     from fusion_service.review.outputs import check_recording
 
     if args.track is None and (args.at is not None or args.out is not None):
-        raise ReviewError("--at and --out are about one track: name it with --track")
+        raise UsageError("--at and --out are about one track: name it with --track")
     if args.out is not None:
         check_recording(args.out, args.recording)
-    mission = read_mission(args.recording, track=args.track, at=args.at, centre=args.centre, stop=stop)
+    try:
+        mission = read_mission(args.recording, track=args.track, at=args.at, centre=args.centre, stop=stop)
+    except Stopped as stopped:
+        print(stopped)
+        return
     if args.track is None:
         print(listing(mission, everything=args.all))
         return

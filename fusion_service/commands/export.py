@@ -6,6 +6,8 @@ import argparse
 import threading
 from pathlib import Path
 
+__all__ = ["EXAMPLE", "HELP", "add", "run"]
+
 HELP = "Tracks of a recording as a table, CSV or Parquet."
 EXAMPLE = (
     "fusion-service export mission.rrd --out tracks.csv\n"
@@ -16,6 +18,7 @@ EXAMPLE = (
 
 
 def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
     parser.add_argument("recording", metavar="FILE", help="recording (.rrd)")
     parser.add_argument("--out", required=True, metavar="FILE", help="new file, .csv or .parquet")
     parser.add_argument("--what", default="global", metavar="WHAT", help="global (default), truth, or a source's name")
@@ -23,6 +26,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    """Write the table. Raises `ReviewError`, FileExistsError, OSError."""
     from fusion_service.review.export import export
 
     done = export(Path(args.recording), Path(args.out), args.what, args.centre, stop.is_set)

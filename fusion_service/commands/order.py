@@ -24,14 +24,9 @@ ANSWER = 5.0
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
-    from fusion_service.commands import units
+    from fusion_service.commands.arguments import moment
     from fusion_service.order import WHAT
-
-    def until(text: str) -> tuple[str, float]:
-        try:
-            return units.moment(text)
-        except ValueError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
+    from fusion_service.process import argument
 
     words = "\n".join(f"  {word:<12}{meaning}" for word, meaning in WHAT.items())
     parser.description = f"{HELP}\n\norders:\n  {'list':<12}the orders that stand\n{words}"
@@ -50,7 +45,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--identity", metavar="TEXT", help="identify: as in mmsi:257054000, icao:4ca7b4")
     parser.add_argument(
         "--until",
-        type=until,
+        type=argument(moment),
         metavar="TIME",
         help="how long it stands: 10min, or 2026-01-31T12:00:00Z (default: always)",
     )
@@ -62,22 +57,21 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Run the command."""
+    """Give the order, or list those that stand. Raises `UsageError`, `OrderError`, `BusError`."""
     import msgpack
 
     from fusion_service.bus import DEFAULT_ENDPOINT, open_bus
-    from fusion_service.config import ConfigError
-    from fusion_service.errors import OrderError
+    from fusion_service.errors import OrderError, UsageError
     from schemas import global_key
 
     try:
         key = global_key(args.centre, "orders", args.realm)
     except ValueError as error:
-        raise ConfigError([f"fusion-service order: {error}"]) from None
+        raise UsageError(str(error)) from None
     request = _request(args)
     missing = _missing(request)
     if missing:
-        raise ConfigError([f"fusion-service order {args.what}: it needs {missing}"])
+        raise UsageError(f"{args.what}: it needs {missing}")
     with open_bus(args.connect or [DEFAULT_ENDPOINT], wait=ANSWER, stop=stop) as bus:
         answers = bus.ask(key, msgpack.packb(request), ANSWER)
     if not answers:

@@ -6,15 +6,19 @@ import argparse
 import threading
 from pathlib import Path
 
+__all__ = ["EXAMPLE", "HELP", "add", "run"]
+
 HELP = "Make the torn recording of a recorder that was killed whole, in place."
 EXAMPLE = "fusion-service repair mission.rrd\n  fusion-service repair mission/         every part of a mission"
 
 
 def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
     parser.add_argument("recording", metavar="PATH", help="recording (.rrd), or a folder of parts")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    """Mend one recording, or all of a folder. Raises `ReviewError`."""
     from fusion_service.errors import ReviewError
     from fusion_service.recording.repair import mend_all
 

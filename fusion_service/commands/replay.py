@@ -48,13 +48,13 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Run the command."""
-    from fusion_service.errors import ReviewError
+    """Fuse it again. Raises `UsageError`, `ConfigError`, `ReviewError`: of --verify too, where the tracks differ."""
+    from fusion_service.errors import ReviewError, UsageError
     from fusion_service.review.outputs import check_page, check_recording
     from fusion_service.review.replay import run_replay
 
     if args.out is None and not args.verify:
-        raise ReviewError("nothing to do: name a recording to write with --out, or compare with --verify")
+        raise UsageError("nothing to do: name a recording to write with --out, or compare with --verify")
     if args.json is not None:
         check_page(args.json, args.recording, *filter(None, [args.config]))
     if args.out is not None:

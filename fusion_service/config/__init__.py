@@ -7,11 +7,10 @@ from fusion_service.config.config import (
     DaemonConfig,
     ServiceConfig,
     SourceConfig,
-    centre_config,
     config_hash,
-    example_toml,
-    load_config,
 )
+from fusion_service.config.example import example_toml
+from fusion_service.config.loading import centre_config, load_config
 
 __all__ = [
     "BusConfig",

@@ -15,8 +15,9 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from fusion_service.config.config import CentreConfig, ConfigError
+from fusion_service.config.config import CentreConfig, ConfigError, SourceConfig
 from fusion_service.config.toml_text import dotted, toml_value
+from schemas import Polygon
 from schemas.values import free_map
 
 __all__ = ["change", "known_settings", "merge", "nested", "plain_settings", "recordable"]
@@ -31,10 +32,20 @@ def plain_settings(config: CentreConfig) -> dict[str, Any]:
     for one in fields(config):
         value = getattr(config, one.name)
         if isinstance(value, Mapping):
-            plain |= {dotted((one.name, str(name))): _plain(item) for name, item in value.items()}
+            for name, item in value.items():
+                plain |= _shallow((one.name, str(name)), item)
         elif value is not None:
-            plain[one.name] = _plain(value)
+            plain |= _shallow((one.name,), value)
     return plain
+
+
+def _shallow(key: tuple[str, ...], value: Any) -> dict[str, Any]:
+    """The setting under its key; the corners of a polygon, too deep for an event of a step log, under their own."""
+    table = _plain(value)
+    if not isinstance(value, SourceConfig) or not isinstance(value.coverage, Polygon):
+        return {dotted(key): table}
+    polygon = table.pop("coverage")
+    return {dotted(key): table} | {dotted((*key, "coverage", name)): part for name, part in polygon.items()}
 
 
 def recordable(config: CentreConfig) -> dict[str, Any] | None:

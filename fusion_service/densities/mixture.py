@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_service import linalg
+from fusion_service.errors import FusionError
 from fusion_service.linalg import FloatArray, total
 
 __all__ = [
@@ -35,7 +36,7 @@ CONDITION = 1e8
 LOG_2PI = float(np.log(2.0 * np.pi))
 
 
-class DensityError(ValueError):
+class DensityError(FusionError, ValueError):
     """What is no mixture, or a reduction that cannot be done: one line that says what and why."""
 
 

@@ -1,7 +1,7 @@
 """Rows that wait for one `send_columns` per entity.
 
 A row logged alone costs Rerun 75-90 us, a row of a column about one: every message of a tick adds its rows
-here, and `Columns.send` writes them, one chunk for each entity, into the recording.
+here, and `ColumnWriter.send` writes them, one chunk for each entity, into the recording.
 
 What is static, and what stands at each place of the picture, is remembered, so that a new part of a recording can
 begin with it.
@@ -18,8 +18,10 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.linalg import FloatArray
+
 __all__ = [
-    "Columns",
+    "ColumnWriter",
     "Lines",
     "Mirror",
     "Points",
@@ -29,7 +31,6 @@ __all__ = [
     "entity",
     "import_rerun",
     "raw",
-    "scalars",
     "texts",
     "weight",
 ]
@@ -39,7 +40,6 @@ log = logging.getLogger(__name__)
 ROW = 500
 """Bytes of a row besides its arrays, about."""
 
-Floats = NDArray[np.float64]
 Classes = NDArray[np.uint16]
 
 
@@ -72,8 +72,8 @@ class Points:
     """T points of one row: plane (T, 2) as Rerun draws it, east and -north in m; geo (T, 2) latitude and longitude
     in degrees, None in a frame without a place on Earth; classes (T,) of the entity's annotation context."""
 
-    plane: Floats
-    geo: Floats | None
+    plane: FloatArray
+    geo: FloatArray | None
     labels: list[str] | None = None
     classes: Classes | None = None
 
@@ -83,11 +83,11 @@ class Lines:
     """S line strips of one row, one after the other: plane (P, 2) and geo (P, 2) as in `Points`; lengths (S,);
     classes (S,) on the plane, widths (S,) in points of the screen, None for the entity's own."""
 
-    plane: Floats
-    geo: Floats | None
+    plane: FloatArray
+    geo: FloatArray | None
     lengths: NDArray[np.int64]
     classes: Classes | None = None
-    widths: Floats | None = None
+    widths: FloatArray | None = None
 
 
 Build = Callable[[Any, Sequence[Any]], list[Any]]
@@ -105,12 +105,14 @@ class Row(NamedTuple):
 class Mirror(Protocol):
     """Who is shown every row and everything static as well."""
 
-    def row(self, row: Row) -> None: ...
+    def row(self, row: Row) -> None:
+        """A row was added."""
 
-    def static(self, path: str, batches: dict[str, Any]) -> None: ...
+    def static(self, path: str, batches: dict[str, Any]) -> None:
+        """The component `batches` of the entity `path`, by name, hold at all times."""
 
 
-class Columns:
+class ColumnWriter:
     """Rows by entity, written to `stream` (a `rerun.RecordingStream`) by `send`, and shown to `mirror` at once."""
 
     def __init__(self, stream: Any, mirror: Mirror | None = None) -> None:
@@ -141,12 +143,15 @@ class Columns:
                 self._mirror.row(row)
 
     def points(self, path: str, stamp: Stamp, content: Points) -> None:
+        """A row of points, which stands until the next."""
         self.add(path, _points, stamp, content, stands=True)
 
     def lines(self, path: str, stamp: Stamp, content: Lines, *, stands: bool = True) -> None:
+        """A row of line strips."""
         self.add(path, _lines, stamp, content, stands=stands)
 
     def scalar(self, path: str, stamp: Stamp, value: float) -> None:
+        """A point of a time series; NaN breaks the line."""
         self.add(path, scalars, stamp, value)
 
     def static(self, path: str, *archetypes: Any, keep: bool = True) -> None:
@@ -251,7 +256,7 @@ def _lines(rr: Any, rows: Sequence[Lines]) -> list[Any]:
     lengths = [len(row.lengths) for row in rows]
     offsets = np.concatenate([[0], *(row.lengths for row in rows)]).cumsum().astype(np.int32)
 
-    def strips(points: Sequence[Floats | None], kind: Any, batch: Any) -> Any:
+    def strips(points: Sequence[FloatArray | None], kind: Any, batch: Any) -> Any:
         flat = pa.array(np.concatenate([part for part in points if part is not None]).ravel(), type=kind)
         pairs = pa.FixedSizeListArray.from_arrays(flat, type=batch([])._ARROW_DATATYPE.value_type)
         return pa.ListArray.from_arrays(pa.array(offsets), pairs, type=batch([])._ARROW_DATATYPE)

@@ -19,7 +19,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from fusion_service.recording.columns import Columns, Row, import_rerun, weight
+from fusion_service.recording.columns import ColumnWriter, Row, import_rerun, weight
 from fusion_service.recording.program import find_program, quiet
 
 __all__ = ["DEFAULT_ADDRESS", "DEFAULT_WEB_PORT", "Live", "address"]
@@ -71,7 +71,7 @@ class Live:
         self._stream = rr.RecordingStream("track-fusion-centre", send_properties=True)
         self._stream.set_sinks(sink)
         self._stream.send_recording_name("live")
-        self._columns = Columns(self._stream)
+        self._columns = ColumnWriter(self._stream)
         self._fresh: list[Row] = []
         self._weight = 0
         self._change = threading.Condition()
@@ -98,6 +98,7 @@ class Live:
             self._statics.setdefault(path, {}).update(batches)
 
     def blueprint(self, blueprint: Any) -> None:
+        """How it opens, from the next `push` on."""
         with self._change:
             self._blueprint = blueprint
 

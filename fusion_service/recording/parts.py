@@ -30,7 +30,8 @@ DEFAULT_SIZE = 500 * 10**6
 @dataclass(frozen=True, slots=True)
 class Rotation:
     """When a part ends, and which parts are kept: by bytes and by seconds, None for no limit. keep_size counts the part
-    that is being written; one that ended more than keep_for ago goes."""
+    that is being written; one that ended more than keep_for ago goes. Raises `ValueError` where keep_size does not hold
+    two parts."""
 
     size: int | None = None
     every: float | None = None
@@ -126,6 +127,7 @@ class Folder:
         self._began = 0.0
 
     def close(self) -> None:
+        """Let others record into it."""
         os.close(self._lock)
 
     def next(self) -> Path:

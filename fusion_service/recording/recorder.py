@@ -4,7 +4,7 @@
                                       where it has one, `time`
     /raw/standing/...                 in a part that goes on from another: the newest info of every source again
 
-and the entities of `drawing`, `charts` and `journal`. What came is queued by `handle` and written by `tick`,
+and the entities of `drawing`, `charts` and `event_log`. What came is queued by `handle` and written by `tick`,
 the raw bytes first; after `tick` has returned it is in the hands of the operating system, and a recorder that
 is killed leaves a file that opens. No message can stop the recorder: what does not decode, or cannot be
 drawn, is kept raw, counted and logged.
@@ -27,7 +27,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from fusion_service.errors import ReviewError
-from fusion_service.recording.columns import Columns, Stamp, entity, import_rerun, raw
+from fusion_service.recording.columns import ColumnWriter, Stamp, entity, import_rerun, raw
 from fusion_service.recording.drawing.blueprint import blueprint, track_blueprint
 from fusion_service.recording.drawing.scene import MAX_SOURCES, PATIENCE, Scene
 from fusion_service.recording.parts import Folder, Rotation, begin, is_folder, number_of, parts
@@ -117,8 +117,8 @@ class Recorder:
                 begins = self._resume(self._folder)
                 self.path = self._folder.next()
             self._open(begins)
-            self._raw = Columns(self._stream)
-            self._columns = Columns(self._stream, live)
+            self._raw = ColumnWriter(self._stream)
+            self._columns = ColumnWriter(self._stream, live)
             self._scene = Scene(self._columns, frame, cutoff, focus)
             if begins == "resume":
                 self._say(f"recording goes on in part {self.path.name}: it was not running before", time.time_ns())
@@ -203,7 +203,7 @@ class Recorder:
                 self._write(0.0, patience=0.0)
                 for reason, count in sorted(self.undrawn.items()):
                     self._say(f"{count} tracks or messages were not drawn: {reason}", time.time_ns())
-                self._scene.journal.release(self._scene.now)
+                self._scene.event_log.release(self._scene.now)
                 self._columns.send()
                 if self._live is not None:
                     self._live.push()
@@ -255,7 +255,7 @@ class Recorder:
         self.path = folder.next()
         self._open("rotation")
         self._written += self._raw.sent
-        self._raw = Columns(self._stream)
+        self._raw = ColumnWriter(self._stream)
         self._arrival = 0
         now = Stamp(time.time_ns(), self._scene.now)
         for _, _, key, data, received in self._infos.values():
@@ -299,7 +299,7 @@ class Recorder:
                 self._writing.close()
 
     def _say(self, text: str, received: int, level: str = "WARN") -> None:
-        self._scene.journal.say("recorder", level, text, Stamp(received, self._scene.now))
+        self._scene.event_log.say("recorder", level, text, Stamp(received, self._scene.now))
 
     def _write(self, interval: float, patience: float = PATIENCE) -> None:
         self._raw.send()

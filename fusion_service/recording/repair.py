@@ -58,7 +58,8 @@ def mend(path: Path, *, index: bool = True) -> Mended:
 
 
 def mend_all(path: Path, stop: Callable[[], bool]) -> Iterator[tuple[Path, Mended | ReviewError]]:
-    """`mend` a file, or each part of a folder, until `stop`; what cannot be mended comes with the reason."""
+    """`mend` a file, or each part of a folder, until `stop`; what cannot be mended comes with the reason. Raises
+    `ReviewError` for a folder without parts."""
     if path.is_dir():
         todo = parts(path)
         if not todo:

@@ -74,7 +74,7 @@ class Survey:
         return self._only([one for one in self.centres.values() if one.logs])
 
     def shown(self, name: str | None) -> RecordedCentre:
-        """The same, be it with step logs or without."""
+        """The same, be it with step logs or without. `ReviewError` if it cannot be told, or there is none."""
         if name is not None:
             return self._named(name)
         one = self._only([one for one in self.centres.values() if one.logs]) or self._only(list(self.centres.values()))

@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
 from fusion_service.geodesy import ecef_to_geodetic, enu_to_geodetic
+from fusion_service.linalg import FloatArray
 from fusion_service.recording import read
 from schemas import (
     COMPONENTS,
@@ -38,10 +38,9 @@ from schemas.flat import frame_text, lower, track_columns
 
 __all__ = ["Exported", "export"]
 
-Floats = NDArray[np.float64]
-Tracks = GlobalTracks | LocalTracks | Truth
-Row = dict[str, Any]
-Write = Callable[[list[Row]], None]
+Exportable = GlobalTracks | LocalTracks | Truth
+TableRow = dict[str, Any]
+Write = Callable[[list[TableRow]], None]
 AS = {GlobalTracks: "global", LocalTracks: "local", Truth: "truth"}
 ROWS = 20_000
 SETTLED = 8
@@ -96,14 +95,14 @@ def export(
     return Exported(rows, times, left_out)
 
 
-def _with(first: Tracks, rest: Iterator[Tracks]) -> Iterator[Tracks]:
+def _with(first: Exportable, rest: Iterator[Exportable]) -> Iterator[Exportable]:
     yield first
     yield from rest
 
 
-def _chosen(path: Path, what: str, centre: str | None, left_out: Counter[str]) -> Iterator[Tracks]:
+def _chosen(path: Path, what: str, centre: str | None, left_out: Counter[str]) -> Iterator[Exportable]:
     """The messages asked for; tracks of others are counted by whose they are."""
-    kind: type[Tracks] = {"global": GlobalTracks, "truth": Truth}.get(what, LocalTracks)
+    kind: type[Exportable] = {"global": GlobalTracks, "truth": Truth}.get(what, LocalTracks)
     name = centre if what == "global" else None if what == "truth" else what
     for raw in read(path):
         try:
@@ -121,7 +120,7 @@ def _chosen(path: Path, what: str, centre: str | None, left_out: Counter[str]) -
             left_out[f"{AS[type(message)]} tracks of {message.source}"] += 1
 
 
-def _rows(message: Tracks) -> Iterator[Row]:
+def _rows(message: Exportable) -> Iterator[TableRow]:
     n = len(message.space)
     if isinstance(message, Truth):
         means, covariances = message.means, np.full((len(message.means), n, n), np.nan)
@@ -159,7 +158,7 @@ def _rows(message: Tracks) -> Iterator[Row]:
         yield row
 
 
-def _contributors(message: Tracks) -> list[str]:
+def _contributors(message: Exportable) -> list[str]:
     if not isinstance(message, GlobalTracks):
         return []
     ends = np.cumsum(message.contributor_counts.astype(int)).tolist()
@@ -167,7 +166,7 @@ def _contributors(message: Tracks) -> list[str]:
     return [" ".join(sorted(set(names[begin:end]))) for begin, end in pairwise([0, *ends])]
 
 
-def _places(message: Tracks, means: Floats) -> Floats | None:
+def _places(message: Exportable, means: FloatArray) -> FloatArray | None:
     """Latitude, longitude (degrees) and altitude (m), (3, T); None in a frame without a place on Earth. A state without
     z lies `height` (0 unless the source says one) above the ellipsoid."""
     xyz = [means[:, message.space.index(name)] if name in message.space else None for name in "xyz"]
@@ -213,7 +212,7 @@ def _parquet(path: Path, names: tuple[str, ...]) -> Iterator[Write]:
         [pa.field(n, kind(n), metadata={b"unit": COMPONENTS[n].encode()} if n in COMPONENTS else None) for n in names],
         metadata=units,
     )
-    waiting: list[Row] = []
+    waiting: list[TableRow] = []
     with parquet.ParquetWriter(path, schema) as writer:
 
         def flush() -> None:
@@ -222,7 +221,7 @@ def _parquet(path: Path, names: tuple[str, ...]) -> Iterator[Write]:
                 writer.write_table(pa.table(columns, schema=schema))
                 waiting.clear()
 
-        def write(rows: list[Row]) -> None:
+        def write(rows: list[TableRow]) -> None:
             waiting.extend(rows)
             if len(waiting) >= ROWS:
                 flush()

@@ -16,9 +16,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.colours import FUSED, TRUTH, source_colours
+from fusion_service.colours import PAPER_FUSED, PAPER_TRUTH, source_colours
 from fusion_service.geodesy import FrameError, ecef_to_geodetic, transform
-from fusion_service.recording.drawing.geometry import outline
+from fusion_service.linalg import FloatArray
+from fusion_service.recording.drawing.geometry import QUANTILE, circle, outline
 from fusion_service.review.snapshots import in_frame, order, truth_path, truth_positions
 from schemas import Ecef, Enu, Frame, GlobalTracks, LocalTracks, Message, SensorInfo, Truth, check_numbers
 from schemas.messages import TENTATIVE
@@ -28,11 +29,8 @@ if TYPE_CHECKING:
 
 __all__ = ["mission_map"]
 
-Floats = NDArray[np.float64]
 
-QUANTILE = -2 * math.log(0.05)
-"""A Gaussian's position lies inside (p - mean)' P^-1 (p - mean) = QUANTILE with 95 %."""
-RING = np.stack([f(np.linspace(0, 2 * np.pi, 49)) for f in (np.cos, np.sin)], axis=-1)
+RING = np.ascontiguousarray(circle(48).T)
 VISIBLE = 0.006
 """The semi-axis an ellipse needs to be seen, as a share of the map's width."""
 MAX_LABELS = 60
@@ -82,23 +80,23 @@ class _Track(NamedTuple):
     """One track over time: times (L,) ns, positions (L, 2) and their covariances (L, 2, 2)."""
 
     times: NDArray[np.int64]
-    xy: Floats
-    covariances: Floats
+    xy: FloatArray
+    covariances: FloatArray
 
 
 class _Mission(NamedTuple):
     """All that is drawn, in one ENU or local frame; positions in m."""
 
     frame: Frame
-    truth: dict[int, tuple[NDArray[np.int64], Floats]]
+    truth: dict[int, tuple[NDArray[np.int64], FloatArray]]
     local: dict[str, list[_Track]]
     fused: list[_Track]
     infos: dict[str, SensorInfo]
-    sensors: dict[str, Floats]
+    sensors: dict[str, FloatArray]
     colours: dict[str, str]
     hidden: list[str]
 
-    def places(self) -> Floats:
+    def places(self) -> FloatArray:
         tracks = [track.xy for one in (*self.local.values(), self.fused) for track in one]
         return np.concatenate([*tracks, *(xy for _, xy in self.truth.values()), *self.sensors.values()])
 
@@ -128,7 +126,7 @@ def _gather(messages: Iterable[Message], frame: Frame | None) -> _Mission:
         raise ValueError("nothing to draw: no track, truth or sensor")
     frame = _level(frame or located[0].frame, located)
     tracks: dict[str, list[_Track]] = {}
-    sensors: dict[str, Floats] = {}
+    sensors: dict[str, FloatArray] = {}
     hidden: list[str] = []
     for name, scans in sorted(local.items()):
         try:
@@ -171,7 +169,7 @@ def _level(frame: Frame, located: Sequence[LocalTracks | GlobalTracks | Truth | 
     raise ValueError("nothing to draw: no place in ECEF, the frame of the map")
 
 
-def _moved(places: Floats, source: Frame, target: Frame) -> Floats:
+def _moved(places: FloatArray, source: Frame, target: Frame) -> FloatArray:
     """Positions (T, 3) -> (T, 2)."""
     return transform(places, np.zeros((len(places), 3, 3)), ("x", "y", "z"), source, target)[0][:, :2]
 
@@ -179,7 +177,7 @@ def _moved(places: Floats, source: Frame, target: Frame) -> Floats:
 def _tracks(messages: Sequence[LocalTracks | GlobalTracks], frame: Frame) -> list[_Track]:
     """The tracks of one source, or of the centre without its tentative ones, in the order of their keys."""
     messages = sorted(messages, key=order)
-    rows: dict[tuple[str, int, int], list[tuple[int, Floats, Floats]]] = {}
+    rows: dict[tuple[str, int, int], list[tuple[int, FloatArray, FloatArray]]] = {}
     for space, indices, means, covariances in in_frame(messages, frame):
         at = [space.index("x"), space.index("y")]
         xy, P = means[:, at], covariances[:, at][:, :, at]
@@ -201,7 +199,7 @@ def _tracks(messages: Sequence[LocalTracks | GlobalTracks], frame: Frame) -> lis
     return found
 
 
-def _bounds(places: Floats) -> tuple[Floats, Floats]:
+def _bounds(places: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Corners of the map: all places with a margin, and not too narrow a strip."""
     low, high = places.min(axis=0), places.max(axis=0)
     middle, half = (low + high) / 2, (high - low) / 2
@@ -209,7 +207,7 @@ def _bounds(places: Floats) -> tuple[Floats, Floats]:
     return middle - half, middle + half
 
 
-def _semi_axes(tracks: Sequence[_Track]) -> Floats:
+def _semi_axes(tracks: Sequence[_Track]) -> FloatArray:
     """Larger semi-axes of all 95 % ellipses, m."""
     spreads = np.concatenate([track.covariances for track in tracks] or [np.zeros((0, 2, 2))])
     return np.sqrt(QUANTILE * np.linalg.eigvalsh(spreads)[:, 1])
@@ -242,7 +240,7 @@ def _draw_sensor(axes: Axes, name: str, info: SensorInfo, mission: _Mission, met
 
 def _name_sensors(axes: Axes, mission: _Mission, metres: float, width: float) -> None:
     """The names of sensors that stand together, within a hundredth of the map's width, on one line."""
-    together: list[tuple[Floats, list[str]]] = []
+    together: list[tuple[FloatArray, list[str]]] = []
     for name, (place,) in mission.sensors.items():
         near = (names for at, names in together if math.dist(at, place) < width / 100)
         names = next(near, None)
@@ -261,19 +259,20 @@ def _draw_tracks(axes: Axes, mission: _Mission, metres: float, when: set[int] | 
     axes.grid(color="#e8e8e8", lw=0.6)
     axes.set_axisbelow(True)
     paths = [xy / metres for _, xy in mission.truth.values()]
-    axes.add_collection(LineCollection(paths, colors=TRUTH, lw=5, alpha=0.55, capstyle="round", zorder=2))
-    axes.plot(*np.array([path[0] for path in paths]).reshape(-1, 2).T, "o", color=TRUTH, ms=6, zorder=2)
+    axes.add_collection(LineCollection(paths, colors=PAPER_TRUTH, lw=5, alpha=0.55, capstyle="round", zorder=2))
+    axes.plot(*np.array([path[0] for path in paths]).reshape(-1, 2).T, "o", color=PAPER_TRUTH, ms=6, zorder=2)
     for name, tracks in mission.local.items():
         lines = [track.xy / metres for track in tracks]
         axes.add_collection(LineCollection(lines, colors=mission.colours[name], lw=2.2, alpha=0.8, zorder=3))
         dots = np.concatenate(lines or [np.zeros((0, 2))])
         axes.plot(*dots.T, ".", color=mission.colours[name], ms=5, alpha=0.9, zorder=3)
-    axes.add_collection(LineCollection([track.xy / metres for track in mission.fused], colors=FUSED, lw=1.0, zorder=4))
+    lines = [track.xy / metres for track in mission.fused]
+    axes.add_collection(LineCollection(lines, colors=PAPER_FUSED, lw=1.0, zorder=4))
     rings = [ring / metres for ring in _rings(mission.fused, when, scale)]
-    axes.add_collection(LineCollection(rings, colors=FUSED, lw=0.9, zorder=5))
+    axes.add_collection(LineCollection(rings, colors=PAPER_FUSED, lw=0.9, zorder=5))
 
 
-def _rings(tracks: Sequence[_Track], when: set[int] | None, scale: float = 1.0) -> list[Floats]:
+def _rings(tracks: Sequence[_Track], when: set[int] | None, scale: float = 1.0) -> list[FloatArray]:
     """95 % ellipses (points, 2), m, of the tracks at the times in `when`, None for all."""
     return [
         xy + scale * math.sqrt(QUANTILE) * RING @ np.linalg.cholesky(P).T
@@ -321,10 +320,10 @@ def _draw_detail(axes: Axes, mission: _Mission, target: int) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _within(mission: _Mission, low: Floats, high: Floats) -> _Mission:
+def _within(mission: _Mission, low: FloatArray, high: FloatArray) -> _Mission:
     """Of the paths and tracks those whose bounding boxes meet the box from `low` to `high`."""
 
-    def meets(xy: Floats) -> bool:
+    def meets(xy: FloatArray) -> bool:
         return bool((xy.min(axis=0) <= high).all() and (xy.max(axis=0) >= low).all())
 
     return mission._replace(
@@ -337,15 +336,15 @@ def _within(mission: _Mission, low: Floats, high: Floats) -> _Mission:
 def _handles(mission: _Mission, scale: int) -> list[object]:
     from matplotlib.lines import Line2D
 
-    handles = (
-        [Line2D([], [], color=TRUTH, lw=5, alpha=0.55, label="truth, a dot where it starts")] if mission.truth else []
-    )
+    handles = []
+    if mission.truth:
+        handles.append(Line2D([], [], color=PAPER_TRUTH, lw=5, alpha=0.55, label="truth, a dot where it starts"))
     for name, colour in mission.colours.items():
         count = len(mission.local.get(name, ()))
         handles.append(Line2D([], [], color=colour, lw=2.2, marker=".", label=f"{name}, local tracks: {count}"))
-    handles.append(Line2D([], [], color=FUSED, lw=1.0, label=f"fused tracks: {len(mission.fused)}"))
+    handles.append(Line2D([], [], color=PAPER_FUSED, lw=1.0, label=f"fused tracks: {len(mission.fused)}"))
     magnified = f", drawn {scale} times as large" if scale > 1 else ""
-    ring: dict[str, Any] = {"marker": "o", "mfc": "none", "mec": FUSED, "ms": 11, "ls": "none"}
+    ring: dict[str, Any] = {"marker": "o", "mfc": "none", "mec": PAPER_FUSED, "ms": 11, "ls": "none"}
     handles.append(Line2D([], [], label=f"95 % ellipse of a fused track{magnified}", **ring))
     if mission.sensors:
         handles.append(Line2D([], [], color="#555555", marker="^", ms=9, ls="--", label="sensor and its field of view"))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_service.densities import moments
 from fusion_service.geodesy import FrameError, transform
+from fusion_service.linalg import FloatArray
 from fusion_service.motion import predict
 from schemas import Frame, GlobalTracks, LocalTracks, Motion, Truth, check_numbers
 from schemas.messages import TENTATIVE
@@ -23,46 +24,42 @@ __all__ = [
     "STALE_PERIODS",
     "STALE_STEPS",
     "Block",
-    "Follower",
+    "Indices",
     "Numbers",
+    "ShownTracks",
+    "Times",
+    "TrackMessage",
     "in_frame",
-    "interval",
     "order",
     "truth_path",
     "truth_positions",
 ]
 
-Floats = NDArray[np.float64]
 Times = NDArray[np.int64]
 Indices = NDArray[np.intp]
 U64 = NDArray[np.uint64]
-Tracks = LocalTracks | GlobalTracks
+TrackMessage = LocalTracks | GlobalTracks
 
 STALE_PERIODS = 3.0
 STALE_STEPS = 2.0
 TRUTH_GAPS = 3.0
 
 
-def order(message: Tracks | Truth) -> tuple[int, int, int]:
+def order(message: TrackMessage | Truth) -> tuple[int, int, int]:
     """Sorting key: time, epoch, sequence."""
     return message.time, message.epoch, message.seq
 
 
-def interval(messages: Sequence[Tracks | Truth]) -> float:
-    """Median interval between the times of messages, s; 0 for a single one."""
-    return _median_step(np.unique([message.time for message in messages]))
-
-
 def truth_path(
     truths: Sequence[Truth], frame: Frame, axes: tuple[str, ...], more: tuple[str, ...] = ()
-) -> dict[int, tuple[Times, Floats]]:
+) -> dict[int, tuple[Times, FloatArray]]:
     """Object id -> its times (L,), ascending, and positions (L, d) in `frame`; the later message of equal times.
 
     more: further components, which are NaN where truth does not say them. Raises ValueError where truth lacks an axis,
     `FrameError` where its frame has no relation to `frame`.
     """
     truths = sorted((truth for truth in truths if len(truth.ids)), key=order)
-    moved: list[Floats] = []
+    moved: list[FloatArray] = []
     for truth in truths:
         own = tuple(name for name in (*"xyz", *more) if name in truth.space)
         if not set(axes) <= set(own):
@@ -87,7 +84,9 @@ def truth_path(
     return {int(ids[begin]): (when[begin:end], places[begin:end]) for begin, end in pairwise([*begins, len(ids)])}
 
 
-def _movable(own: tuple[str, ...], means: Floats, source: Frame, target: Frame) -> tuple[tuple[str, ...], Floats]:
+def _movable(
+    own: tuple[str, ...], means: FloatArray, source: Frame, target: Frame
+) -> tuple[tuple[str, ...], FloatArray]:
     """States in another frame; without their derivatives where these cannot be moved."""
     try:
         return own, transform(means, np.zeros((*means.shape, len(own))), own, source, target)[0]
@@ -98,7 +97,7 @@ def _movable(own: tuple[str, ...], means: Floats, source: Frame, target: Frame) 
         return short, transform(means[:, at], still, short, source, target)[0]
 
 
-def truth_positions(known: Times, path: Floats, times: Times, gap: float) -> Floats:
+def truth_positions(known: Times, path: FloatArray, times: Times, gap: float) -> FloatArray:
     """Positions (K, d) of one object at `times`, linear between `known` (L,), `path` (L, d).
 
     NaN before the first and after the last, and inside a gap longer than `gap` seconds and than `TRUTH_GAPS`
@@ -118,26 +117,26 @@ def truth_positions(known: Times, path: Floats, times: Times, gap: float) -> Flo
 class Block(NamedTuple):
     """The tracks shown at K times, R in all, time after time: rows ends[k]:ends[k + 1] at the time k.
 
-    number (R,): of the track, small integers that stand for (epoch, id) as long as its `Follower` lives. states
-    (R, m) in the follower's components, NaN where the track's space lacks one; covariances (R, d, d) of the position.
+    number (R,): of the track, small integers that stand for (epoch, id) as long as its `ShownTracks` live. states
+    (R, m) in its components, NaN where the track's space lacks one; covariances (R, d, d) of the position.
     """
 
     ends: Indices
     number: Indices
-    states: Floats
-    covariances: Floats
+    states: FloatArray
+    covariances: FloatArray
 
 
 class _Part(NamedTuple):
     """The sound tracks of one message: numbers (M,), and states (M, n), covariances (M, n, n) in the frame."""
 
-    message: Tracks
+    message: TrackMessage
     space: tuple[str, ...]
     number: Indices
-    means: Floats
-    covariances: Floats
+    means: FloatArray
+    covariances: FloatArray
 
-    def take(self, kept: NDArray[np.bool_]) -> _Part:
+    def select(self, kept: NDArray[np.bool_]) -> _Part:
         return self._replace(number=self.number[kept], means=self.means[kept], covariances=self.covariances[kept])
 
 
@@ -175,7 +174,7 @@ class Numbers:
         return np.where(known[at] == ids, numbers[at], -1)
 
 
-class Follower:
+class ShownTracks:
     """What one source, or one centre, shows as time goes on.
 
     A source shows of its newest epoch the newest version of each track, unless a later complete scan left it out or it
@@ -197,7 +196,7 @@ class Follower:
         self._parts: list[_Part] = []
         self._epoch = 0
 
-    def take(self, messages: Sequence[Tracks]) -> None:
+    def add(self, messages: Sequence[TrackMessage]) -> None:
         """Messages to be shown from their time on. Raises `FrameError` where a frame has no relation to the frame."""
         parts: list[_Part | None] = [None] * len(messages)
         sound = [codes == 0 for codes in check_numbers(messages)]
@@ -211,7 +210,7 @@ class Follower:
                 good = sound[index] & finite[rows]
                 if isinstance(message, GlobalTracks):
                     good = good & (message.status != TENTATIVE)
-                parts[index] = part if good.all() else part.take(good)
+                parts[index] = part if good.all() else part.select(good)
         self._coming.extend(part for part in parts if part is not None)
 
     def show(self, times: Times) -> tuple[Block, list[GlobalTracks | None]]:
@@ -234,7 +233,7 @@ class Follower:
                 if message.epoch > self._epoch or message.complete:
                     self._parts, self._epoch = [], message.epoch
                 elif self._parts and len(part.number):
-                    left = [old.take(~np.isin(old.number, part.number)) for old in self._parts]
+                    left = [old.select(~np.isin(old.number, part.number)) for old in self._parts]
                     self._parts = [old for old in left if len(old.number)]
                 self._parts.append(part)
         self._parts = [part for part in self._parts if time - part.message.time <= self._limit]
@@ -268,7 +267,9 @@ class Follower:
         return Block(ends, number, states, spreads)
 
 
-def in_frame(messages: Sequence[Tracks], frame: Frame) -> Iterator[tuple[tuple[str, ...], list[int], Floats, Floats]]:
+def in_frame(
+    messages: Sequence[TrackMessage], frame: Frame
+) -> Iterator[tuple[tuple[str, ...], list[int], FloatArray, FloatArray]]:
     """All tracks in `frame`, mixtures as their mean and covariance, for each state space that occurs:
     the space, the indices of its messages, and their tracks one after another, means (R, n), covariances (R, n, n).
 

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service import linalg
+from fusion_service.errors import FusionError
 from fusion_service.linalg import FloatArray
 
 CRITERIA: Mapping[str, tuple[str, ...]] = {
@@ -17,7 +18,7 @@ FEWEST = 200
 """Samples that a sampled rule works with at least."""
 
 
-class RuleError(ValueError):
+class RuleError(FusionError, ValueError):
     """What a fusion was asked for cannot be done: one line that says what, where and why."""
 
 

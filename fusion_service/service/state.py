@@ -15,13 +15,15 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from fusion_service.errors import FusionError
+
 __all__ = ["State", "StateError", "open_state"]
 
 YEAR_2020 = 1_577_836_800
 SYNC_PERIOD = 5.0
 
 
-class StateError(Exception):
+class StateError(FusionError):
     """The folder cannot be used, and why, in one line."""
 
 
@@ -37,9 +39,9 @@ class State:
         self._synced = 0.0
         self._last = 0
 
-    def take_generation(self) -> int:
-        """A generation that was never taken before, on disk when this returns. `StateError` or `OSError` if it
-        cannot be; the next one after the last of this process is then safe only as long as it lives."""
+    def new_generation(self) -> int:
+        """A generation that was never taken before, on disk when this returns. Raises `StateError` or
+        OSError if it cannot be; the next one after the last of this process is then safe only as long as it lives."""
         last = self._last
         if self._folder is not None:
             path = self._folder / "generation"
@@ -93,7 +95,7 @@ class State:
 
 @contextlib.contextmanager
 def open_state(folder: str | None) -> Iterator[State]:
-    """The state in `folder` (made if need be), held against a second service. `StateError` if it cannot be."""
+    """The state in `folder` (made if need be), held against a second service. Raises `StateError` if it cannot be."""
     if folder is None:
         yield State(None)
         return

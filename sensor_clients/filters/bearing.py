@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service import linalg, motion
-from sensor_clients.filters.measurement import STATE, Floats, MeasurementModel
+from sensor_clients.filters.measurement import STATE, Floats, MeasurementModel, sight_covariance
 from sensor_clients.filters.mixture import MixtureTracker
 from sensor_clients.filters.tracker import TrackerConfig
 
@@ -67,12 +67,11 @@ class Bearing:
     def intervals(self, returns: Floats) -> tuple[Floats, Floats]:
         """Means (2, C, M) and covariances (2, 2, C, M) of the place in each interval of range, for bearings (1, M)."""
         sight = np.stack([np.sin(returns[0]), np.cos(returns[0])])[:, None]
-        across = np.stack([sight[1], -sight[0]])
         near, far = np.array(self.edges[:-1])[:, None], np.array(self.edges[1:])[:, None]
         r, sigma = (near + far) / 2, (far - near) / math.sqrt(12)
         spread = (r * self.sigma_bearing) ** 2 + self.sigma_cross**2
         places = np.array(self.origin)[:, None, None] + r * sight
-        return places, sigma**2 * linalg.outer(sight, sight) + spread * linalg.outer(across, across)
+        return places, sight_covariance(sight, sigma**2, spread)
 
 
 class BearingTracker(MixtureTracker):

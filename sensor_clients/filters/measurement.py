@@ -21,7 +21,16 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 
-__all__ = ["STATE", "MeasurementModel", "Position", "Prediction", "RangeAzimuth", "predict_measurement"]
+__all__ = [
+    "STATE",
+    "Floats",
+    "MeasurementModel",
+    "Position",
+    "Prediction",
+    "RangeAzimuth",
+    "predict_measurement",
+    "sight_covariance",
+]
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -138,6 +147,13 @@ class Position:
 
     def locate(self, returns: Floats) -> tuple[Floats, Floats]:
         return returns.copy(), self.noise(returns)
+
+
+def sight_covariance(sight: Floats, along: float | Floats, across: float | Floats) -> Floats:
+    """Covariances (2, 2, ...) of variance `along` the vectors `sight` (2, ...) and `across` them, each (...) and in
+    units of the vector's squared length."""
+    normal = np.stack([sight[1], -sight[0]])
+    return np.asarray(along * linalg.outer(sight, sight) + across * linalg.outer(normal, normal))
 
 
 def predict_measurement(

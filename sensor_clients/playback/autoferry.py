@@ -18,13 +18,25 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fusion_service.errors import DataError
 from schemas import Disk, Enu, Height
 from sensor_clients.events import Event, Parameter, Scenario
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback.cameras import EO, IR, CameraSensor, CameraTracker
 from sensor_clients.playback.harbour import LIDAR, RADAR, HarbourSensor, HarbourTracker
 
-__all__ = ["PARAMETERS", "PIREN", "SCENARIOS", "SENSORS", "SUMMARY", "Scan", "load", "read_scans", "read_truth"]
+__all__ = [
+    "PARAMETERS",
+    "PIREN",
+    "SCENARIOS",
+    "SENSORS",
+    "SUMMARY",
+    "Scan",
+    "load",
+    "read_scans",
+    "read_truth",
+    "sensor_events",
+]
 
 SCENARIOS = (2, 3, 4, 5, 6, 13, 16, 17, 22)
 SUMMARY = "lidar, radar and cameras of a small ferry among two vessels, about 2 minutes"
@@ -51,7 +63,8 @@ class Scan(NamedTuple):
 
 
 def read_scans(path: Path, sensor_id: int) -> list[Scan]:
-    """Scans of one sensor in the order of time. ValueError for a file that is not one of detections."""
+    """Scans of one sensor in the order of time. Raises FileNotFoundError, and
+    `DataError` for a file that is not one of detections."""
     scans = []
     for record in _read(path):
         try:
@@ -63,12 +76,13 @@ def read_scans(path: Path, sensor_id: int) -> list[Scan]:
             returns = returns.reshape(1, -1) if camera else returns.reshape(2, -1)[::-1] + own[:, None]
             scans.append(Scan(round(record["time"] * SECOND), own, returns))
         except (KeyError, TypeError, ValueError) as error:
-            raise ValueError(f"{path}: a detection cannot be read ({type(error).__name__}: {error})") from None
+            raise DataError(f"{path}: a detection cannot be read ({type(error).__name__}: {error})") from None
     return sorted(scans, key=lambda scan: scan.time)
 
 
 def read_truth(path: Path) -> dict[int, tuple[Floats, Floats]]:
-    """Each vessel's fixes in the order of time, each once: target -> (times (K,), Unix s; x and y (K, 2), m)."""
+    """Each vessel's fixes in the order of time, each once: target -> (times (K,), Unix s; x and y (K, 2), m).
+    Raises FileNotFoundError, and `DataError` for a file that is none of truth."""
     fixes: dict[int, dict[float, tuple[float, float]]] = {}
     for record in _read(path):
         for fix in record:
@@ -76,7 +90,7 @@ def read_truth(path: Path) -> dict[int, tuple[Floats, Floats]]:
                 north, east = fix["position"][:2]
                 fixes.setdefault(int(fix["targetID"]), {})[float(fix["time"])] = float(east), float(north)
             except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(f"{path}: a fix cannot be read ({type(error).__name__}: {error})") from None
+                raise DataError(f"{path}: a fix cannot be read ({type(error).__name__}: {error})") from None
     return {
         target: (np.array(sorted(places)), np.array([places[time] for time in sorted(places)]))
         for target, places in sorted(fixes.items())
@@ -89,10 +103,10 @@ def _read(path: Path) -> list[Any]:
             records = json.load(file)
     except FileNotFoundError:
         raise FileNotFoundError(f"{path} is not there: give the directory of the Autoferry JSON files") from None
-    except json.JSONDecodeError as error:
-        raise ValueError(f"{path} is not JSON: {error}") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} is not JSON: {error}") from None
     if not isinstance(records, list):
-        raise ValueError(f"{path} does not hold a list of records")
+        raise DataError(f"{path} does not hold a list of records")
     return records
 
 
@@ -140,13 +154,14 @@ def truth_events(truth: dict[int, tuple[Floats, Floats]], start: int, end: int) 
 
 
 def load(directory: Path, number: int) -> Scenario:
-    """Scenario `number` from its two files. FileNotFoundError, ValueError say what is wrong with which file."""
+    """Scenario `number` from its two files. Raises FileNotFoundError and `DataError`, which say what is
+    wrong with which file."""
     detections = directory / f"scenario{number}_detections.json"
     scans = {name: read_scans(detections, sensor.sensor_id) for name, sensor in SENSORS.items()}
     truth = read_truth(directory / f"scenario{number}_groundTruth.json")
     ranging = [scans[name] for name in ("lidar", "radar")]
     if not all(ranging) or not truth:
-        raise ValueError(f"{detections} or the truth beside it is empty")
+        raise DataError(f"{detections} or the truth beside it is empty")
     start = min(found[0].time for found in ranging)
     end = max(found[-1].time for found in ranging)
     return Scenario(

@@ -9,16 +9,15 @@ a vessel that comes straight on is not, until it passes.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fusion_service import linalg
 from schemas import Motion
 from sensor_clients.events import Parameter
 from sensor_clients.filters import Bearing, BearingTracker, Report, TrackerConfig
-from sensor_clients.filters.measurement import Floats
-from sensor_clients.playback.harbour import SECOND, ClutterMap, parameters
+from sensor_clients.filters.measurement import Floats, sight_covariance
+from sensor_clients.playback.following import SECOND, ClutterMap, follow, parameters
 
 __all__ = ["EO", "IR", "CameraSensor", "CameraTracker"]
 
@@ -31,7 +30,7 @@ SOURCES = {
     "coverage_detection": "chosen: what one period adds, misses lasting long",
     "initiation_delay": "chosen",
 }
-"""Where each number comes from; all others are `TUNED`."""
+"""Where each number comes from; all others are `following.TUNED`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,21 +71,6 @@ class CameraSensor:
         return parameters(self, self.tracker, SOURCES)
 
 
-EDGES = (12.0, 21.5, 38.6, 69.3, 124.3, 223.0, 400.0)
-TRACKER = TrackerConfig(
-    motion=Motion("cv", 0.08),
-    survival=0.98,
-    sigma_speed=4.0,
-    gate=12.0,
-    confirm=0.95,
-    drop=0.1,
-    drop_tentative=0.01,
-    merge=4.0,
-    extent=8.0,
-    min_way=0.1,
-    min_speed=0.003,
-)
-
 IR = CameraSensor(
     name="ir",
     sensor_id=3,
@@ -94,7 +78,7 @@ IR = CameraSensor(
     latency=0.3,
     sigma_bearing=0.02,
     sigma_cross=3.0,
-    edges=EDGES,
+    edges=(12.0, 21.5, 38.6, 69.3, 124.3, 223.0, 400.0),
     reference_bearing=0.03,
     reference_cross=9.0,
     reference_range=0.25,
@@ -106,29 +90,27 @@ IR = CameraSensor(
     coverage=150.0,
     coverage_detection=0.02,
     initiation_delay=10.0,
-    tracker=TRACKER,
+    tracker=TrackerConfig(
+        motion=Motion("cv", 0.08),
+        survival=0.98,
+        sigma_speed=4.0,
+        gate=12.0,
+        confirm=0.95,
+        drop=0.1,
+        drop_tentative=0.01,
+        merge=4.0,
+        extent=8.0,
+        min_way=0.1,
+        min_speed=0.003,
+    ),
 )
 
-EO = CameraSensor(
+EO = replace(
+    IR,
     name="eo",
     sensor_id=4,
-    period=0.5,
-    latency=0.3,
-    sigma_bearing=0.02,
-    sigma_cross=3.0,
-    edges=EDGES,
-    reference_bearing=0.03,
-    reference_cross=9.0,
-    reference_range=0.25,
     detection=((0.0, 0.8), (100.0, 0.7), (200.0, 0.4), (500.0, 0.1)),
     clutter=0.5,
-    births=0.01,
-    map_sigma=0.04,
-    map_scans=20.0,
-    coverage=150.0,
-    coverage_detection=0.02,
-    initiation_delay=10.0,
-    tracker=TRACKER,
 )
 
 
@@ -151,30 +133,15 @@ class CameraTracker:
         self._due = max(self._due + period, time + period // 2)
         self._own = own
         model = Bearing(sensor.sigma_bearing, sensor.sigma_cross, sensor.edges, (float(own[0]), float(own[1])))
-        ranges, probabilities = np.array(sensor.detection).T
-
-        def detection(place: Floats) -> Floats:
-            return np.asarray(np.interp(np.hypot(*(place - own[:, None])), ranges, probabilities))
-
-        clutter = self.clutter.intensity(bearings)
-        unused = self.tracker.step(
-            time - round(sensor.latency * SECOND),
-            bearings,
-            model,
-            clutter,
-            np.full(len(clutter), sensor.births),
-            detection,
-        )
-        self.clutter.learn(bearings, unused)
+        follow(self.tracker, self.clutter, sensor, time, own, bearings, model)
         return True
 
     def report(self, time: int) -> Report:
         """The confirmed tracks, predicted to `time`, ns, as mixtures over range."""
         report = self.tracker.report(time)
         sight = report.means[:, :2].T - self._own[:, None]
-        across = np.stack([sight[1], -sight[0]])
         r2 = np.sum(sight * sight, axis=0)
-        spread = self.sensor.reference_bearing**2 + self.sensor.reference_cross**2 / np.maximum(r2, 1.0)
-        lasting = spread * linalg.outer(across, across) + self.sensor.reference_range**2 * linalg.outer(sight, sight)
+        across = self.sensor.reference_bearing**2 + self.sensor.reference_cross**2 / np.maximum(r2, 1.0)
+        lasting = sight_covariance(sight, self.sensor.reference_range**2, across)
         report.covariances[:, :2, :2] += lasting.transpose(2, 0, 1)
         return report

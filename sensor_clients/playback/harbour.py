@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
@@ -13,12 +11,10 @@ from schemas import Motion
 from sensor_clients.events import Parameter
 from sensor_clients.filters import LocalTracker, Position, Report, TrackerConfig
 from sensor_clients.filters.measurement import Floats
+from sensor_clients.playback.following import ClutterMap, follow, parameters
 
-__all__ = ["LIDAR", "RADAR", "ClutterMap", "HarbourSensor", "HarbourTracker", "cluster", "parameters"]
+__all__ = ["LIDAR", "RADAR", "HarbourSensor", "HarbourTracker", "cluster"]
 
-SECOND = 10**9
-
-TUNED = "tuned on scenarios 2, 3, 5, 13, 16"
 SOURCES = {
     "period": "median of the data",
     "latency": "best fit to the truth of 2, 3, 5, 13, 16",
@@ -26,7 +22,7 @@ SOURCES = {
     "coverage_detection": "chosen",
     "initiation_delay": "chosen",
 }
-"""Where each number comes from; all others are `TUNED`."""
+"""Where each number comes from; all others are `following.TUNED`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,18 +66,6 @@ class HarbourSensor:
         return parameters(self, self.tracker, SOURCES)
 
 
-def parameters(sensor: Any, config: TrackerConfig, sources: Mapping[str, str]) -> list[Parameter]:
-    """One row per number of the sensor and of its tracker's `config`, each with its source, or else `TUNED`."""
-    rows = [
-        Parameter(f"{sensor.name} {field.name}", str(getattr(sensor, field.name)), sources.get(field.name, TUNED))
-        for field in fields(sensor)
-        if field.name not in ("name", "sensor_id", "tracker")
-    ]
-    rows.append(Parameter(f"{sensor.name} tracker motion", f"{config.motion.kind}, q = {config.motion.q:g}", TUNED))
-    names = [field.name for field in fields(config) if field.name not in ("motion", "cubature")]
-    return rows + [Parameter(f"{sensor.name} tracker {name}", str(getattr(config, name)), TUNED) for name in names]
-
-
 LIDAR = HarbourSensor(
     name="lidar",
     sensor_id=1,
@@ -118,6 +102,7 @@ LIDAR = HarbourSensor(
         min_speed=0.5,
     ),
 )
+
 
 RADAR = HarbourSensor(
     name="radar",
@@ -167,33 +152,6 @@ def cluster(returns: Floats, distance: float) -> Floats:
     return np.asarray(returns @ member.T)
 
 
-class ClutterMap:
-    """Intensity of false returns, learned from those that no reported track claims, what lies still among them:
-    a gamma prior of `prior` (1/m2 and scan) worth `scans` scans, and a Gaussian kernel of `sigma` m about every
-    return since. `angles`: the returns are bearings, (1, M) rad, and so are the units."""
-
-    def __init__(self, prior: float, sigma: float, scans: float, angles: bool = False) -> None:
-        self._prior, self._sigma, self._scans, self._angles = prior, sigma, scans, angles
-        self._places: Floats = np.zeros((1 if angles else 2, 0))
-        self._weights: Floats = np.zeros(0)
-        self._learned = 0
-
-    def intensity(self, places: Floats) -> Floats:
-        """Intensity (M,) at places (2, M)."""
-        away = places[:, :, None] - self._places[:, None]
-        if self._angles:
-            away = (away + np.pi) % (2 * np.pi) - np.pi
-        squared = np.sum(away**2, axis=0)
-        kernel = np.exp(-0.5 * squared / self._sigma**2) / (2 * np.pi * self._sigma**2) ** (len(places) / 2)
-        return np.asarray((self._prior * self._scans + kernel @ self._weights) / (self._scans + self._learned))
-
-    def learn(self, returns: Floats, unused: Floats) -> None:
-        """One scan's returns (2, M) with the probability (M,) of each that it is of no reported track."""
-        self._places = np.concatenate([self._places, returns], axis=1)
-        self._weights = np.concatenate([self._weights, unused])
-        self._learned += 1
-
-
 class HarbourTracker:
     """The local tracker of one `HarbourSensor`, scan by scan."""
 
@@ -213,21 +171,7 @@ class HarbourTracker:
             returns = returns + sensor.offset * sight / distance
         returns = cluster(returns, sensor.cluster)
         model = Position(sensor.sigma_range, sensor.sigma_cross, sensor.sigma_azimuth, (float(own[0]), float(own[1])))
-        ranges, probabilities = np.array(sensor.detection).T
-
-        def detection(place: Floats) -> Floats:
-            return np.asarray(np.interp(np.hypot(*(place - own[:, None])), ranges, probabilities, right=0.0))
-
-        clutter = self.clutter.intensity(returns)
-        unused = self.tracker.step(
-            time - round(sensor.latency * SECOND),
-            returns,
-            model,
-            clutter,
-            np.full(len(clutter), sensor.births),
-            detection,
-        )
-        self.clutter.learn(returns, unused)
+        follow(self.tracker, self.clutter, sensor, time, own, returns, model, beyond=0.0)
         return True
 
     def report(self, time: int) -> Report:

@@ -17,11 +17,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.errors import DataError
 from schemas import check_name, unpack_lower
 from schemas.flat import frame_of, lower, space_of
 from sensor_clients.events import Event, Scenario
 
-__all__ = ["SUFFIXES", "load"]
+__all__ = ["SUFFIXES", "lineage", "load"]
 
 Floats = NDArray[np.float64]
 SUFFIXES = (".csv", ".parquet")
@@ -44,20 +45,24 @@ class _Table(NamedTuple):
 
 
 def load(path: Path) -> Scenario:
-    """The tracks of `path` as a scenario. FileNotFoundError; ValueError says what is wrong, and where."""
+    """The tracks of `path` as a scenario. Raises FileNotFoundError, ImportError for Parquet
+    without pyarrow, and `DataError`, which says what is wrong, and where."""
     table = _read(path)
     if not len(table.time):
-        raise ValueError(f"{path}: no rows")
+        raise DataError(f"{path}: no rows")
     order = np.argsort(table.time, kind="stable")
     names = np.array(table.source)
     truth = np.array(table.kind) == "truth"
-    sensors = {
-        check_name(name): partial(_tracks, table, order[(names == name)[order] & ~truth[order]])
-        for name in dict.fromkeys(names[~truth].tolist())
-    }
+    try:
+        sensors = {
+            check_name(name): partial(_tracks, table, order[(names == name)[order] & ~truth[order]])
+            for name in dict.fromkeys(names[~truth].tolist())
+        }
+    except ValueError as error:
+        raise DataError(f"{path}: {error}") from None
     bad = np.flatnonzero(~truth & ~np.isfinite(table.packed).all(axis=1))
     if len(bad):
-        raise ValueError(f"{path}: row {bad[0] + 2} has no covariance")
+        raise DataError(f"{path}: row {bad[0] + 2} has no covariance")
     first, last = int(table.time[order[0]]), int(table.time[order[-1]])
     return Scenario(
         name=path.stem,
@@ -102,7 +107,8 @@ def _scans(table: _Table, rows: NDArray[np.intp]) -> list[NDArray[np.intp]]:
 
 
 def lineage(path: Path, sensor: str) -> tuple[str, ...] | None:
-    """The sources whose data the tracks of `sensor` contain; None where the table says none."""
+    """The sources whose data the tracks of `sensor` contain; None where the table says none.
+    Raises as `load` does."""
     table = _read(path)
     said = {text for text, name in zip(table.lineage, table.source, strict=True) if name == sensor and text}
     return tuple(sorted({name for text in said for name in text.split()})) or None
@@ -113,7 +119,7 @@ def _read(path: Path) -> _Table:
     try:
         space = space_of(tuple(columns))
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from None
+        raise DataError(f"{path}: {error}") from None
 
     def numbers(name: str) -> list[float]:
         return [
@@ -130,7 +136,7 @@ def _read(path: Path) -> _Table:
         try:
             return kind(value)
         except (TypeError, ValueError):
-            raise ValueError(f"{path}: row {row + 2}: {name} is {value!r}, no number") from None
+            raise DataError(f"{path}: row {row + 2}: {name} is {value!r}, no number") from None
 
     covariances = [f"cov_{space[i]}_{space[j]}" for i, j in lower(space)]
     try:
@@ -150,19 +156,24 @@ def _read(path: Path) -> _Table:
             np.array([numbers(name) for name in covariances]).reshape(len(covariances), -1).T.copy(),
         )
     except OverflowError:
-        raise ValueError(f"{path}: a time or a track id is too large") from None
+        raise DataError(f"{path}: a time or a track id is too large") from None
+    except DataError:
+        raise
     except ValueError as error:
-        raise error if str(path) in str(error) else ValueError(f"{path}: {error}") from None
+        raise DataError(f"{path}: {error}") from None
 
 
 def _csv(path: Path) -> dict[str, list[Any]]:
     with path.open(newline="", encoding="utf-8") as file:
         reader = csv.reader(file)
-        names = next(reader, [])
-        rows = list(reader)
+        try:
+            names = next(reader, [])
+            rows = list(reader)
+        except (UnicodeDecodeError, csv.Error) as error:
+            raise DataError(f"{path} is no CSV file ({error})") from None
     for number, row in enumerate(rows, 2):
         if len(row) != len(names):
-            raise ValueError(f"{path}: row {number} has {len(row)} fields, not {len(names)}")
+            raise DataError(f"{path}: row {number} has {len(row)} fields, not {len(names)}")
     return {name: [row[k] for row in rows] for k, name in enumerate(names)}
 
 
@@ -171,11 +182,11 @@ def _parquet(path: Path) -> dict[str, list[Any]]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        raise ValueError(f"Parquet needs pyarrow ({error}): pip install 'track-fusion-centre[record]'") from None
+        raise ImportError(f"Parquet needs pyarrow ({error}): pip install 'track-fusion-centre[record]'") from None
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}")
     try:
         columns: dict[str, list[Any]] = parquet.read_table(path).to_pydict()
     except pa.ArrowInvalid as error:
-        raise ValueError(f"{path} is no Parquet file ({error})") from None
+        raise DataError(f"{path} is no Parquet file ({error})") from None
     return columns

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 import schemas
-from fusion_service.centre.cells import Components, find_cells, fuse_cells, reduced
+from fusion_service.centre.cells import Components, cells_and_reach, fuse_cells, reduced
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import gospa
 from sensor_clients.filters import GmPhdFilter, PhdConfig, Position
@@ -97,17 +97,20 @@ def components(report: dict[str, Any], number: int) -> Components:
 
 def fused(parts: list[Components]) -> list[Components]:
     """The intensities of N sensors fused by each of `RULES`, heaviest component first, as `IntensityCentre` does it
-    for sources that cover everything."""
+    for sources that declare to cover everything, and no detection probability."""
     columns = ("weight", "mean", "covariance", "share")
     joined = Components(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in columns))
     joined = replace(joined, share=joined.share[: len(parts)])
     source = np.repeat(np.arange(len(parts)), [len(part.weight) for part in parts])
-    cell = find_cells(joined, source, [0, 1], GATE)
+    cell, reached = cells_and_reach(joined, source, [0, 1], GATE)
 
     def everywhere(mean: Floats) -> NDArray[np.bool_]:
         return np.ones((len(parts), mean.shape[1]), dtype=np.bool_)
 
-    return [reduced(fuse_cells(rule, "average", joined, source, cell, everywhere), *LIMITS) for rule in RULES]
+    return [
+        reduced(fuse_cells(rule, "average", joined, source, cell, everywhere, reached=reached), *LIMITS)
+        for rule in RULES
+    ]
 
 
 def one_run(key: tuple[int, ...]) -> Floats:

@@ -4,6 +4,8 @@ import logging
 import re
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -486,3 +488,12 @@ def test_an_exception_in_the_block_passes_through(hub: Hub) -> None:
 
     with pytest.raises(ZeroDivisionError):
         fail()
+
+
+def test_importing_the_bus_loads_no_zenoh() -> None:
+    """Nor does the endpoint or the inbox: only what opens a session does."""
+    code = (
+        "import sys\nimport fusion_service.bus as bus\nfrom fusion_service.bus import DEFAULT_ENDPOINT, Inbox\n"
+        "assert 'zenoh' not in sys.modules\nbus.open_bus\nassert 'zenoh' in sys.modules"
+    )
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

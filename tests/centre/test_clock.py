@@ -5,13 +5,14 @@ from __future__ import annotations
 import tracemalloc
 from time import process_time
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion_service.centre import MessageClock, WallClock
 from fusion_service.config import CentreConfig
-from tests.centre.worlds import SECOND, START
+from tests.centre.worlds import SECOND, START, tracks
 
 
 def clock(**config: float) -> MessageClock:
@@ -218,15 +219,52 @@ def test_the_wall_clock_steps_on_its_grid_behind_now_and_skips_what_was_slept_th
     assert one.skipped == 8
 
 
-def test_a_wall_clock_that_is_set_back_says_how_far_and_does_not_step_twice() -> None:
-    one = WallClock(CentreConfig(period=1.0, delay=0.5))
-    assert one.behind(START) == 0.0
-    one.due(START)
-    assert one.due(START + 10 * SECOND + SECOND // 2) == START + 10 * SECOND
-    assert one.behind(START + 10 * SECOND + SECOND // 2) == 0.0
-    back = START - 3590 * SECOND
-    assert one.due(back) is None
-    assert one.behind(back) == 3600.5
-    assert one.due(START + 10 * SECOND) is None
-    assert one.due(START + 11 * SECOND + SECOND // 2) == START + 11 * SECOND
-    assert one.behind(START + 11 * SECOND + SECOND // 2) == 0.0
+def fed(of: MessageClock, *messages: tuple[str, float]) -> list[bool]:
+    taken = []
+    for name, at in messages:
+        taken.append(see(of, name, at))
+        drain(of)
+    return taken
+
+
+def test_a_lone_source_that_falls_back_is_refused_while_it_happens() -> None:
+    one = start(feed=0.0)
+    assert all(fed(one, *(("feed", float(k)) for k in range(1, 60))))
+    back = fed(one, *(("feed", k - 86400.0) for k in range(60, 120)))
+    assert back == [True] * one.FEW + [False] * (60 - one.FEW)
+    # right again: it is followed at once
+    assert fed(one, ("feed", 120.0)) == [True]
+    assert drain(one) == []
+    see(one, "feed", 121.0)
+    assert drain(one) == [121.0]
+
+
+def test_where_everybody_falls_back_for_the_lead_steps_begin_again_from_there() -> None:
+    one = start(a=0.0, b=0.0)
+    fed(one, *((name, float(k)) for k in range(1, 60) for name in "ab"))
+    lead = 60 + 3 + 10
+    steps = []
+    for k in range(60, 60 + lead + 20):
+        for name in "ab":
+            see(one, name, k - 86400.0)
+        steps += drain(one)
+    assert steps == [float(k) - 86400 for k in range(60 + lead, 60 + lead + 20)]
+    assert all(fed(one, ("a", 200 - 86400.0), ("b", 200 - 86400.0)))
+
+
+def test_one_of_two_that_falls_back_changes_nothing() -> None:
+    one = start(a=0.0, b=0.0)
+    for k in range(1, 130):
+        assert see(one, "a", float(k))
+        assert see(one, "b", k - 86400.0 if k >= 60 else float(k))
+        assert all(step >= k - 4 for step in drain(one))
+
+
+def test_the_reason_is_late_or_future() -> None:
+    one = start(feed=100.0)
+    one.presence("other", True)
+    messages = [tracks("feed", second, np.zeros((0, 4)), seq=0) for second in (1.0, 2.0, 3.0, 4.0, 101.0)]
+    faults = [one.fault(message, START + 10**6 * SECOND) for message in messages]
+    assert faults == ["", "", "", "late", ""]
+    assert one.fault(messages[-1], START) == "future"
+    assert one.fault(tracks("other", WRONG, np.zeros((0, 4)), seq=0), START + 10**7 * SECOND) == "future"

@@ -83,12 +83,89 @@ def test_a_weak_track_is_not_shown_and_comes_back() -> None:
     assert len(step(made, 4).tracks.ids) == 0
 
 
-def test_sources_without_an_opinion_leave_it_alone() -> None:
+def odds(r: float) -> float:
+    return r / (1 - r)
+
+
+def test_a_detection_of_a_source_without_an_opinion_is_evidence_by_bayes() -> None:
+    """Detection probability .9 (usual) against a tenth of false reports: each new datum multiplies the odds by 9."""
     made = centre(("r1", "r2"))
     states = truth(3)
     give(made, tracks("r1", 1, states), tracks("r2", 1, states, existence=np.array([0.5, 0.6, 0.7])))
-    assert sorted(step(made, 1).tracks.existence) == pytest.approx([0.5, 0.6, 0.7])
+    said = [9 * odds(r) for r in (0.5, 0.6, 0.7)]
+    assert sorted(step(made, 1).tracks.existence) == pytest.approx([o / (1 + o) for o in said])
     give(made, tracks("r1", 2, moved(states, 1), sigma=SIGMA), tracks("r2", 2, np.zeros((0, 4))))
-    assert sorted(step(made, 2).tracks.existence) == pytest.approx([0.5, 0.6, 0.7])
+    assert sorted(step(made, 2).tracks.existence) == pytest.approx([9 * o / (1 + 9 * o) for o in said])
     assert made.config.frame is None
     assert step(made, 3).tracks.frame == FRAME
+
+
+def test_a_repeated_opinion_is_one_and_silence_wears_it_down() -> None:
+    made = centre(("r1",), survival=0.9, coast=20.0)
+    for second in (1, 2, 3):
+        give(made, tracks("r1", second, SPOT, existence=np.array([0.8])))
+        assert step(made, second).tracks.existence[0] == pytest.approx(0.8)
+    for k in (1, 2, 3):
+        assert step(made, 3 + k).tracks.existence[0] == pytest.approx(0.8 * 0.9**k)
+
+
+def test_a_blind_source_wears_nothing_down_that_others_hold_and_is_forgiven() -> None:
+    made = centre(("r1", "r3"))
+    give(made, watcher(1e4))
+    for second in range(1, 30):
+        give(made, tracks("r1", second, SPOT), tracks("r3", second, SPOT), tracks("r2", second, np.zeros((0, 4))))
+        existence = step(made, second).tracks.existence[0]
+    assert existence > 0.4
+    give(made, tracks("r1", 30, SPOT), tracks("r3", 30, SPOT), tracks("r2", 30, SPOT))
+    assert step(made, 30).tracks.existence[0] > 0.999
+
+
+def test_initiation_delay_counts_from_entry_into_coverage() -> None:
+    """A target outside the disk for ten seconds, then inside: two seconds pass before its absence says anything."""
+    made = centre(("r1",))
+    give(made, watcher(1e4, initiation_delay=2.0))
+    place = 20_000.0
+    seen = {}
+    for second in range(1, 16):
+        place = 20_000.0 if second < 10 else 5_000.0 if second == 10 else place
+        give(made, tracks("r1", second, [[place, 0, 0, 0]], [second // 10 + 1], existence=np.array([0.8])))
+        give(made, tracks("r2", second, np.zeros((0, 4))))
+        picture = step(made, second).tracks
+        row = int(np.argmin(np.abs(picture.means[:, 0] - place)))
+        seen[second] = float(picture.existence[row])
+    assert [seen[k] for k in range(1, 12)] == pytest.approx([0.8] * 11)
+    assert seen[12] == pytest.approx(0.4 / 1.4)
+    assert seen[13] < 0.05
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_of_tracks_reported_at_some_existence_so_many_exist(seed: int) -> None:
+    """Two sensors of known detection probability and false reports; short-lived, so that every value occurs."""
+    rng = np.random.default_rng(seed)
+    p, false = 0.6, 0.3
+    said, real = [], []
+    for _ in range(150):
+        made = centre((), birth_existence=0.3, survival=1.0, coast=100.0, confirm_within=60,
+                      source_defaults={"false_track": false})  # fmt: skip
+        for name in ("r1", "r2"):
+            give(made, info(name, coverage=schemas.Disk(1e6), detection_probability=p))
+        exists = rng.random(20) < 0.3
+        places = np.column_stack([np.arange(20) * 1000.0, np.zeros((20, 3))])
+        for second in range(1, 1 + int(rng.integers(1, 5))):
+            for name in ("r1", "r2"):
+                shown = rng.random(20) < np.where(exists, p, false)
+                if second == 1 and name == "r1":
+                    start = shown
+                chosen = np.flatnonzero(shown & start)
+                give(made, tracks(name, second, places[chosen], chosen + 1))
+            picture = step(made, second).tracks
+        for row, place in zip(picture.existence, picture.means[:, 0], strict=True):
+            said.append(float(row))
+            real.append(bool(exists[round(place / 1000.0)]))
+    told, true = np.array(said), np.array(real)
+    for low in np.arange(0.0, 1.0, 0.2):
+        some = (told >= low) & (told < low + 0.2)
+        if some.sum() >= 100:
+            error = np.sqrt(0.25 / some.sum())
+            assert abs(told[some].mean() - true[some].mean()) < 0.1 + 2 * error, (seed, low, int(some.sum()))
+    assert len(told) > 500

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
@@ -102,20 +103,21 @@ def test_an_intensity_is_predicted_with_its_sources_motion() -> None:
 
 @pytest.mark.parametrize(("rule", "blind"), [("aa", 0.3), ("ga", 0.0), ("hybrid", 0.3)])
 def test_coverage_decides_whether_silence_is_evidence(rule: str, blind: float) -> None:
-    """The third target is in the disk of r3 only; without disks every source is taken to see everywhere."""
-    for disks, expected in ((True, 0.9), (False, blind)):
+    """The third target is in the disk of r3 only, or in all disks, or nobody says what it covers."""
+    for radius, expected in ((6000.0, 0.9), (9000.0, blind), (None, 0.9)):
         one = centre((), intensity_rule=rule)
-        for name, radius in (("r1", 6000.0), ("r2", 6000.0), ("r3", 9000.0)):
-            give(one, info(name, coverage=Disk(radius) if disks else None))
+        for name, own in (("r1", radius), ("r2", radius), ("r3", radius and 9000.0)):
+            give(one, info(name, coverage=Disk(own) if own else None))
         for name, seen in (("r1", STATES[:2]), ("r2", STATES[:2]), ("r3", STATES)):
             give(one, intensity(name, 1, seen))
         result = step(one, 1)
         assert mass(one) == pytest.approx(1.8 + expected)
-        assert len(result.tracks.ids) == (3 if disks else 2)
+        assert len(result.tracks.ids) == (3 if expected == 0.9 else 2)
 
 
 def test_an_empty_intensity_says_nobody_is_there_a_stale_or_spoiled_one_nothing() -> None:
-    one = centre(("r1", "r2"))
+    one = centre(())
+    give(one, info("r1", coverage=Disk(9000.0)), info("r2", coverage=Disk(9000.0)))
     give(one, intensity("r1", 1, STATES[:1]))
     step(one, 1)
     assert mass(one) == pytest.approx(0.9)
@@ -169,6 +171,170 @@ def test_only_sources_that_may_start_tracks_do() -> None:
     assert not len(step(one, 1).tracks.ids)
     give(one, info("r2"), intensity("r1", 2, STATES), intensity("r2", 2, STATES))
     assert len(step(one, 2).tracks.ids) == 3
+
+
+@pytest.mark.parametrize("rule", ["aa", "ga", "hybrid"])
+@pytest.mark.parametrize("covered", [None, "own"])
+def test_two_sources_far_apart_keep_both_targets(rule: str, covered: str | None) -> None:
+    one = centre((), intensity_rule=rule)
+    for name, x in (("r1", 0.0), ("r2", 80_000.0)):
+        give(one, info(name, position=(x, 0.0, 0.0), coverage=Disk(5000.0) if covered else None))
+    targets = np.array([[0.0, 0, 10, 0], [80_000.0, 0, 0, 10]])
+    for second in (1, 2, 3):
+        there = moved(targets, second)
+        give(one, intensity("r1", second, there[:1]), intensity("r2", second, there[1:]))
+        result = step(one, second).tracks
+        assert mass(one) == pytest.approx(1.8)
+    assert result.status.tolist() == [CONFIRMED, CONFIRMED]
+    np.testing.assert_allclose(np.sort(result.means[:, 0]), np.sort(moved(targets, 3)[:, 0]), atol=1e-6)
+
+
+SITE = np.diag([1e4, 1e4, 1.0])
+"""The covariance of a position known to 100 m."""
+
+
+@pytest.mark.parametrize("rule", ["aa", "ga", "hybrid"])
+@pytest.mark.parametrize("stated", ["info", "config", "override", "nobody"])
+@pytest.mark.parametrize("error", [100.0, 300.0])
+def test_a_registration_error_that_is_stated_deletes_nobody(rule: str, stated: str, error: float) -> None:
+    """Two sources that cover a target see it `error` apart at sigma 30 m. Stated as 100 m (300 m is 2.1 sigma of the
+    difference) it is one target with most of its number; the expected mass of ga is its formula, by hand."""
+    sources: dict[str, Any] = {"r1": {"registration_sigma": 100.0}, "r2": {"registration_sigma": 100.0}}
+    if stated == "override":
+        sources = {name: {**one, "override": True} for name, one in sources.items()}
+    one: Any = IntensityCentre({"intensity_rule": rule, "sources": sources if stated in ("config", "override") else {}})
+    covariance = {"info": SITE, "override": SITE * 1e-9}.get(stated)
+    for name in ("r1", "r2"):
+        give(one, info(name, coverage=Disk(9000.0), position_covariance=covariance))
+    for second in (1, 2):
+        give(one, intensity("r1", second, [[0.0, 0, 0, 0]]), intensity("r2", second, [[error, 0, 0, 0]]))
+        result = step(one, second).tracks
+    variance = 900.0 + (1e4 if stated != "nobody" else 0.0)
+    apart = 2 * (error / 2) ** 2 / variance
+    expected = 0.9 * (np.exp(-apart / 4) if rule == "ga" else 1.0)
+    if stated == "nobody" and error == 300.0:
+        assert mass(one) == pytest.approx(0.0 if rule == "ga" else 0.9), "each half, denied by the other"
+        assert not len(result.ids)
+        return
+    assert mass(one) == pytest.approx(expected)
+    if expected > 0.5:
+        assert result.status.tolist() == [CONFIRMED]
+        np.testing.assert_allclose(result.means[0], [error / 2, 0, 0, 0], atol=1e-6)
+        spread = 900.0 + (error / 2) ** 2 * (rule == "aa") + (1e4 if stated != "nobody" else 0.0)
+        np.testing.assert_allclose(result.covariances[0, 0, 0], spread, rtol=1e-6)
+
+
+def test_a_track_keeps_its_id_when_one_of_two_shifted_sources_falls_silent() -> None:
+    one = centre((), coast=1.0)
+    for name in ("r1", "r2"):
+        give(one, info(name, position_covariance=SITE))
+    ids = set()
+    for second in range(1, 12):
+        give(one, intensity("r1", second, [[0.0, 0, 0, 0]]))
+        if second < 4:
+            give(one, intensity("r2", second, [[350.0, 0, 0, 0]]))
+        result = step(one, second).tracks
+        ids |= set(result.ids.tolist())
+    assert len(ids) == 1
+    np.testing.assert_allclose(result.means[0, 0], 0.0, atol=1e-6)
+
+
+def test_what_is_stated_of_registration_never_raises() -> None:
+    odd = [
+        np.diag([1e4, -1e4, 0.0]),
+        np.full((3, 3), 1e300),
+        np.full((3, 3), np.nan),
+        np.zeros((3, 3)),
+        np.ones((2, 2)),
+    ]
+    for covariance in odd:
+        one = centre(("r2",))
+        give(one, info("r1", position_covariance=covariance, frame=schemas.Enu(59.5, -55.0)))
+        give(one, *(intensity(name, 1, STATES) for name in ("r1", "r2")))
+        result = step(one, 1)
+        assert len(result.tracks.ids) == 3
+        assert not schemas.check_numbers([result.tracks])[0].any()
+
+
+@pytest.mark.parametrize("p", [None, 0.0, 0.6, 1.0])
+def test_a_covering_source_that_reports_nothing_denies_by_its_detection_probability(p: float | None) -> None:
+    one = centre(("r1",), intensity_threshold=0.1)
+    give(one, info("r2", coverage=Disk(9000.0), detection_probability=p))
+    give(one, intensity("r1", 1, STATES[:1]), intensity("r2", 1, []))
+    step(one, 1)
+    assert mass(one) == pytest.approx((0.9 + (1 - (1.0 if p is None else p)) * 0.9) / 2)
+
+
+@pytest.mark.parametrize("extract", ["threshold", "rank"])
+def test_a_weight_of_two_is_two_tracks_that_do_not_flicker(extract: str) -> None:
+    one = centre(("r1",), intensity_extract=extract)
+    told = []
+    weights = [2.0, 2.02, 1.4, 1.6, 1.5, 1.42, 1.58, 1.9, 2.3, 1.41, 1.0, 1.02, 1.6, 1.45, 1.59, 2.0]
+    for second, weight in enumerate(weights, 1):
+        give(one, intensity("r1", second, moved(STATES[:1], second), weight))
+        told.append(step(one, second).tracks)
+    standing = [set(t.ids[t.status != COASTING].tolist()) for t in told]
+    assert [len(ids) for ids in standing] == [2] * 10 + [1] * 5 + [2]
+    assert all(ids <= standing[0] for ids in standing)
+    assert standing[10] == {min(standing[0])}, "the older stays"
+    assert (told[9].status == CONFIRMED).all()
+    np.testing.assert_allclose(told[4].existence, [0.75, 0.75])
+    np.testing.assert_allclose(told[4].means, np.repeat(moved(STATES[:1], 5), 2, axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize("extract", ["threshold", "rank"])
+def test_two_in_one_component_part_with_their_ids(extract: str) -> None:
+    one = centre(("r1",), intensity_extract=extract)
+    for second in (1, 2, 3):
+        give(one, intensity("r1", second, [[0.0, 0, 0, 0]], 2.0))
+        together = step(one, second).tracks.ids.tolist()
+    left = set()
+    for second in range(4, 10):
+        apart = 4.0 * (second - 3)
+        give(one, intensity("r1", second, [[-apart, 0, -4, 0], [apart, 0, 4, 0]], [1.0, 0.95]))
+        result = step(one, second).tracks
+        assert result.ids.tolist() == together
+        assert (result.status == CONFIRMED).all()
+        left.add(int(result.ids[result.means[:, 0].argmin()]))
+    assert len(left) == 1
+    np.testing.assert_allclose(np.sort(result.means[:, 0]), [-24, 24], atol=1e-6)
+
+
+def test_steps_without_new_data_change_no_life() -> None:
+    """A track is seen once, then its source is silent while the centre steps on: neither confirmed nor forgotten; its
+    number does not grow on one datum; and a source far away that declares what it sees changes nothing."""
+    one = centre(("r1",), stale_periods=100.0)
+    give(one, info("r9", position=(3e5, 0.0, 0.0), coverage=Disk(1000.0)))
+    give(one, intensity("r1", 1, STATES[:1], 1.0))
+    step(one, 1)
+    give(one, intensity("r1", 1.2, STATES[:1], 1.8, seq=2))
+    first = step(one, 1.2).tracks
+    assert first.status.tolist() == [CONFIRMED]
+    for k in range(1, 40):
+        give(one, intensity("r9", 1.2 + 0.1 * k, [[3e5, 0, 0, 0]], seq=k))
+        result = step(one, 1.2 + 0.1 * k).tracks
+        near = np.abs(result.means[:, 0]) < 1e4
+        assert result.ids[near].tolist() == first.ids.tolist()
+    two = centre(("r1",), stale_periods=100.0)
+    give(two, intensity("r1", 1, STATES[:1]))
+    for k in range(20):
+        result = step(two, 1 + 0.1 * k).tracks
+        assert result.status.tolist() == [TENTATIVE]
+    give(two, intensity("r1", 3, STATES[:1]))
+    assert step(two, 3).tracks.status.tolist() == [CONFIRMED]
+
+
+def test_a_dead_sources_report_is_evidence_once() -> None:
+    """r1 has died; what it said last lies under a single report of r2 and confirms nothing more."""
+    one = centre(("r1", "r2"), confirm_hits=3, confirm_sources=2, stale_periods=100.0)
+    give(one, intensity("r1", 1, STATES[:1]))
+    step(one, 1)
+    for k in range(1, 30):
+        assert step(one, 1 + 0.1 * k).tracks.status.tolist() == [TENTATIVE]
+    give(one, intensity("r2", 4, STATES[:1]))
+    assert step(one, 4).tracks.status.tolist() == [TENTATIVE]
+    give(one, intensity("r2", 5, STATES[:1]))
+    assert step(one, 5).tracks.status.tolist() == [CONFIRMED]
 
 
 def test_orders_mute_a_source_and_delete_a_track() -> None:
@@ -285,12 +451,15 @@ def test_the_order_of_arrival_does_not_matter(options: dict[str, Any]) -> None:
     assert len(set(results)) == 1
 
 
-def test_a_checkpoint_goes_on_bit_for_bit_and_only_in_its_own_kind() -> None:
+@pytest.mark.parametrize("extract", ["threshold", "rank"])
+def test_a_checkpoint_goes_on_bit_for_bit_and_only_in_its_own_kind(extract: str) -> None:
     def messages(second: int) -> list[Any]:
         rng = np.random.default_rng(second)
-        return [intensity(n, second, STATES + rng.normal(size=(3, 4)), rng.uniform(0.3, 1, 3)) for n in ("r1", "r2")]
+        return [intensity(n, second, STATES + rng.normal(size=(3, 4)), rng.uniform(0.3, 2, 3)) for n in ("r1", "r2")]
 
-    one = centre()
+    one: Any = IntensityCentre(
+        {"lateness": 3.0, "intensity_extract": extract, "sources": {"r2": {"registration_sigma": 20.0}}}
+    )
     for second in (1, 2, 3):
         give(one, *messages(second))
         step(one, second)
@@ -312,13 +481,71 @@ def test_a_checkpoint_goes_on_bit_for_bit_and_only_in_its_own_kind() -> None:
     assert (7 << 32) + 1 in step(again, 30).tracks.ids.tolist()
 
 
+def test_the_evidence_for_a_number_is_in_the_checkpoint() -> None:
+    """One datum of two that are needed, a restart, and the other; without what is kept it would take three."""
+    weights = [1.0, 1.9, 1.9]
+    told = []
+    for restart in (False, True):
+        one = centre(("r1",))
+        for second, weight in enumerate(weights, 1):
+            if restart and second == 3:
+                one = IntensityCentre(one.config, one.checkpoint())
+            give(one, intensity("r1", second, STATES[:1], weight))
+            told.append(len(step(one, second).tracks.ids))
+    assert told == [1, 1, 2] * 2
+
+
+def test_names_of_sources_do_not_matter() -> None:
+    """The same reports under other names, hence in another order: the same places and numbers, to rounding."""
+    said = {"a": (3, Disk(9000.0), 0.7, SITE), "b": (2, None, None, None), "c": (1, Disk(6000.0), 0.9, None)}
+    pictures = []
+    for names in (("a", "b", "c"), ("c", "a", "b"), ("b", "c", "a")):
+        one = centre(())
+        for name, (count, coverage, p, covariance) in zip(names, said.values(), strict=True):
+            give(one, info(name, coverage=coverage, detection_probability=p, position_covariance=covariance))
+            give(one, intensity(name, 1, STATES[:count] + 10.0 * count, [0.9, 2.1, 0.8][:count]))
+        result = step(one, 1).tracks
+        order = np.lexsort((result.means[:, 1].round(3), result.means[:, 0].round(3)))
+        pictures.append((result.means[order], result.covariances[order], result.existence[order]))
+    assert len(pictures[0][0]) >= 3
+    for other in pictures[1:]:
+        for a, b in zip(pictures[0], other, strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
+
+
+def test_a_place_carries_a_bounded_number_of_tracks() -> None:
+    for extract in ("threshold", "rank"):
+        one = centre(("r1",), intensity_extract=extract)
+        for second in (1, 2, 3):
+            give(one, intensity("r1", second, STATES, [1000.0, 3.0, 0.9]))
+            result = step(one, second)
+        assert len(result.tracks.ids) == 24
+        assert (result.tracks.status == CONFIRMED).all()
+        assert result.status.tracks["expected"] == 1004
+
+
+def test_an_old_checkpoint_can_be_used_and_a_spoiled_one_not() -> None:
+    one = centre(("r1",))
+    give(one, intensity("r1", 1, STATES))
+    step(one, 1)
+    packed = msgpack.unpackb(one.checkpoint(), strict_map_key=False)
+    del packed["own"]
+    old: Any = IntensityCentre(one.config, msgpack.packb(packed))
+    give(old, intensity("r1", 2, STATES))
+    assert len(step(old, 2).tracks.ids) == 3
+    for spoiled in (7, {}, {"memory": {}, "heard": {}, "total": 0, "total_lean": 0.0}):
+        with pytest.raises(CheckpointError, match="cannot be read"):
+            IntensityCentre(one.config, msgpack.packb({**packed, "own": spoiled}))
+
+
 def test_a_mission_is_made_again_from_its_logs(monkeypatch: pytest.MonkeyPatch) -> None:
-    one: Any = IntensityCentre({"lateness": 2.0}, generation=1, epoch=100)
+    config = {"lateness": 2.0, "sources": {"r1": {"registration_sigma": 50.0}}}
+    one: Any = IntensityCentre(config, generation=1, epoch=100)
     recorded: list[Any] = []
     rng = np.random.default_rng(1)
     for second in range(1, 8):
         sent: list[Any] = [
-            intensity(n, second, STATES + rng.normal(size=(3, 4)), rng.uniform(0, 1, 3)) for n in ("r1", "r2")
+            intensity(n, second, STATES + rng.normal(size=(3, 4)), rng.uniform(0, 2.2, 3)) for n in ("r1", "r2")
         ]
         sent += [info("r1", seq=second), sent[0], tracks("r2", second, STATES)]
         give(one, *sent)

@@ -418,7 +418,8 @@ def test_constraints_against_a_plain_search() -> None:
         link = rng.integers(0, 5, 12).astype(np.uint64)
         epoch = (source + 5).astype(np.uint64)
         table = dataclasses.replace(empty_tracks(2), id=ids.astype(np.uint64), link=link)
-        rows = Rows(source, epoch, table, np.ones(12, dtype=np.bool_), {})
+        every, interval = np.ones(12, dtype=np.bool_), np.full(12, 10**9)
+        rows = Rows(source, epoch, table, every, interval, lost=~every, fresh=every, kept={})
         who = [LocalId(names[s], int(e), int(i)) for s, e, i in zip(source, epoch, ids, strict=True)]
 
         def pick(k: int, who: list[LocalId] = who) -> LocalId:

@@ -20,7 +20,7 @@ from fusion_service.recording import Recorder, messages
 from fusion_service.review.evaluation import assess, evaluate
 from fusion_service.review.evaluation.logbook import Logbook
 from fusion_service.review.export import export
-from schemas import Entry, GlobalTracks, StepLog, Truth, digest, global_key
+from schemas import Entry, GlobalTracks, Message, StepLog, Truth, digest, global_key
 from tests.helpers.missions import info, picture, tracks
 from tests.recording.mission import START, Sent, mission
 
@@ -214,7 +214,8 @@ def test_the_reaction_to_an_info_is_not_that_to_tracks_of_its_number() -> None:
     log = next(one.message for one in mission(4) if isinstance(one.message, StepLog))
     taken = Entry("a", told.epoch, told.seq, digest(told))
     log = replace(log, source=shown.source, epoch=shown.epoch, step=shown.step, taken=(taken,))
-    for arrival, (message, at) in enumerate([(said, 0.0), (told, 60.0), (log, 60.1), (shown, 60.1)]):
+    came: list[tuple[Message, float]] = [(said, 0.0), (told, 60.0), (log, 60.1), (shown, 60.1)]
+    for arrival, (message, at) in enumerate(came):
         book._note(message, arrival, START + round(at * second))
     book._close()
     assert book.latency["reaction", shown.source].largest == pytest.approx(0.1)
@@ -277,7 +278,7 @@ def test_a_signal_ends_it_with_what_was_done(flown: Path, capsys: pytest.Capture
 def test_agreement_grows_with_a_bias(said: list[Sent]) -> None:
     """One source is 60 m off: the d2 of its pairs is above the bounds, that of the others is not."""
     moved = [
-        replace(sent.message, means=sent.message.means + np.array([60.0, 0, 0, 0]))  # type: ignore[union-attr, call-arg]
+        replace(sent.message, means=sent.message.means + np.array([60.0, 0, 0, 0]))  # type: ignore[union-attr]
         if sent.key == "fusion/v1/local/radar1/tracks"
         else sent.message
         for sent in said

@@ -13,10 +13,11 @@ from typing import Any
 
 import pytest
 
-from fusion_service import demo
 from fusion_service.cli import main
 from fusion_service.config import ConfigError, load_config
-from fusion_service.demo import DemoError, run_demo
+from fusion_service.demo import DemoError, plan_mission, run_demo
+from fusion_service.demo import run as run_module
+from fusion_service.errors import DataError, UsageError
 from fusion_service.recording import messages
 from schemas import Enu, GlobalTracks, StepLog, Truth
 from tests.helpers import fuse_again
@@ -131,7 +132,7 @@ def test_scores_that_cannot_be_written_are_told_before_anything_is_there(tmp_pat
 
 
 def test_settings_of_the_command_are_above_those_of_the_scenario(tmp_path: Path, monkeypatch: Any) -> None:
-    monkeypatch.setattr(demo, "_fly", lambda *_: None)
+    monkeypatch.setattr(run_module, "_fly", lambda *_: None)
     stop = threading.Event()
     stop.set()
     out = tmp_path / 'a "b"\\c \U0001f6a2\x7f'
@@ -161,6 +162,35 @@ def test_bad_values_of_options_are_bad_usage(arguments: tuple[str, ...], capsys:
         main(arguments)
     assert caught.value.code == 2
     assert f"argument {arguments[1]}: {arguments[2]!r} is not " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("scenario", "options", "words"),
+    [
+        ("two-radars", {}, "unknown scenario"),
+        ("three-radars", {"cameras": True}, "--cameras goes with"),
+        ("autoferry:2", {"tracker": "imm"}, "--tracker goes with"),
+        ("autoferry:2", {}, "--data or in FUSION_DATA"),
+    ],
+)
+def test_what_is_no_mission_is_bad_usage(
+    scenario: str, options: dict[str, Any], words: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("FUSION_DATA", raising=False)
+    with pytest.raises(UsageError, match=words) as caught:
+        plan_mission(scenario, **options)
+    assert caught.value.exit_code == 2
+
+
+def test_the_data_may_stand_in_a_folder_of_their_name(tmp_path: Path) -> None:
+    inside = tmp_path / "autoferry"
+    inside.mkdir()
+    (inside / "scenario2_detections.json").touch()
+    with pytest.raises(DataError, match=r"no scenario3_detections\.json in"):
+        plan_mission("autoferry:3", data=str(tmp_path))
+    for given in (tmp_path, inside):
+        plan = plan_mission("autoferry:2", data=str(given))
+        assert str(inside) in plan.clients["lidar"]
 
 
 @pytest.mark.skipif("FUSION_DATA" not in os.environ, reason="set FUSION_DATA to the folder of the Autoferry recordings")

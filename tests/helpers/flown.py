@@ -14,12 +14,25 @@ import schemas
 from fusion_service.centre import FusionCentre, IntensityCentre, Order, SourceFound, SourceLost, StepResult
 from fusion_service.config import centre_config
 from fusion_service.recording import RawMessage, Recorder, read
+from fusion_service.review.replay import Replay, run_replay
 from tests.centre.worlds import SECOND, START, info, moved, seen, tracks, truth
 
 SOURCES = ("r1", "r2", "r3")
 REALM = "sea"
 
-__all__ = ["REALM", "SIGTERM", "SOURCES", "Flight", "edited", "messy", "places", "raws", "record"]
+__all__ = [
+    "REALM",
+    "SIGTERM",
+    "SOURCES",
+    "Flight",
+    "edited",
+    "messy",
+    "pictures",
+    "places",
+    "raws",
+    "record",
+    "verified",
+]
 
 
 class Flight:
@@ -72,6 +85,17 @@ def record(path: Path, log: Iterable[tuple[str, bytes, int]], *, draw: bool = Fa
 
 def raws(path: Path) -> list[RawMessage]:
     return list(read(path))
+
+
+def verified(path: Path, **asked: Any) -> Replay:
+    """What comes of making a recording again as it was."""
+    return run_replay(path, verify=True, say=lambda line: None, **asked)
+
+
+def pictures(path: Path, centre: str) -> list[schemas.GlobalTracks]:
+    """The recorded pictures of a centre, as they came."""
+    key = schemas.global_key(centre, "tracks", REALM)
+    return [schemas.decode(raw.data) for raw in raws(path) if raw.key == key]  # type: ignore[misc]
 
 
 def edited(log: Sequence[tuple[str, bytes, int]], change: Callable[[Any], Any]) -> list[tuple[str, bytes, int]]:

@@ -8,14 +8,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import Enu, GlobalTracks, LocalTracks, Motion, SensorInfo, Truth
+from schemas import Enu, GlobalTracks, LocalTracks, Message, Motion, SensorInfo, Truth
 
 Array = NDArray[np.float64]
+Places = Sequence[Sequence[float]] | Array
+"""Rows (T, 2) of x, y, or (T, 4) of x, vx, y, vy; m, m/s."""
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
 FRAME = Enu(60.0, 10.0)
 SPACE = ("x", "vx", "y", "vy")
+STILL = [[0.0, 0.0]]
 
 
 def at(seconds: float) -> int:
@@ -23,7 +26,7 @@ def at(seconds: float) -> int:
     return START + round(seconds * SECOND)
 
 
-def states(places: Sequence[Sequence[float]]) -> Array:
+def states(places: Places) -> Array:
     """(x, y) or (x, vx, y, vy) rows -> (T, 4)."""
     rows = np.array(places, dtype=float).reshape(len(places), len(places[0]) if len(places) else 4)
     return rows if rows.shape[1] == 4 else np.insert(rows, [1, 2], 0.0, axis=1)
@@ -38,7 +41,7 @@ def info(source: str, period: float = 1.0, q: float = 0.0, epoch: int = 1, **res
     return SensorInfo(**header(source, 0.0, epoch), period=period, **given)
 
 
-def truth(seconds: float, ids: Sequence[int], places: Sequence[Sequence[float]], **rest: Any) -> Truth:
+def truth(seconds: float, ids: Sequence[int], places: Places, **rest: Any) -> Truth:
     given: dict[str, Any] = {"space": SPACE, "frame": FRAME, "means": states(places)} | rest
     return Truth(**header("world", seconds, 1), time=at(seconds), ids=np.array(ids, dtype=np.uint64), **given)
 
@@ -47,7 +50,7 @@ def tracks(
     source: str,
     seconds: float,
     ids: Sequence[int],
-    places: Sequence[Sequence[float]],
+    places: Places,
     sigma: float = 1.0,
     epoch: int = 1,
     **rest: Any,
@@ -63,7 +66,7 @@ def tracks(
 def picture(
     seconds: float,
     ids: Sequence[int],
-    places: Sequence[Sequence[float]],
+    places: Places,
     sigma: float = 1.0,
     centre: str = "centre",
     **rest: Any,
@@ -93,3 +96,9 @@ def picture(
         contributor_influence=np.zeros(0),
         **given,
     )
+
+
+def still(seconds: int) -> list[Message]:
+    """One object at rest at the origin, and a centre that sees it perfectly, every second."""
+    times = range(seconds + 1)
+    return [*(truth(t, [1], STILL) for t in times), *(picture(t, [1], STILL) for t in times)]

@@ -30,7 +30,12 @@ def spread() -> np.ndarray[Any, np.dtype[np.float64]]:
 
 def mixture(seconds: float, ids: tuple[int, int] = (7, 8), **rest: Any) -> LocalTracks:
     """A track of three components, and one that is Gaussian."""
-    given = {"means": missions.states(PLACES), "covariances": spread(), "counts": COUNTS, "weights": WEIGHTS} | rest
+    given: dict[str, Any] = {
+        "means": missions.states(PLACES),
+        "covariances": spread(),
+        "counts": COUNTS,
+        "weights": WEIGHTS,
+    } | rest
     return missions.tracks("a", seconds, ids, [], **given)
 
 

@@ -13,7 +13,7 @@ from rerun.chunk import RrdReader
 from scipy.stats import chi2
 
 from fusion_service.recording import read
-from fusion_service.recording.drawing.geometry import moments
+from fusion_service.recording.drawing.geometry import track_moments
 from schemas import Ecef, Enu, Local, Message, Polygon, encode, global_key, local_key
 from tests.helpers import missions
 from tests.recording.contents import opacities, record, row, rows, texts
@@ -34,7 +34,7 @@ def test_a_recording_brings_its_own_layout(flown: tuple[Path, list[Sent]]) -> No
 
 def test_places_are_those_of_another_geodesy(flown: tuple[Path, list[Sent]]) -> None:
     path, said = flown
-    centre = next(sent.message.frame for sent in said if sent.key == global_key("main", "tracks"))  # type: ignore[union-attr]
+    centre: Any = next(sent.message.frame for sent in said if sent.key == global_key("main", "tracks"))  # type: ignore[union-attr]
     for name, frame in RADARS.items():
         message: Any = next(sent.message for sent in said if sent.key == local_key(name, "tracks"))
         drawn = row(path, f"/picture/local/{name}", message.time)
@@ -97,7 +97,7 @@ def test_sensors_and_what_they_see(flown: tuple[Path, list[Sent]]) -> None:
 
 def test_a_sensor_is_drawn_from_its_arrival_on(tmp_path: Path) -> None:
     """And one that was there before the first track from then on."""
-    said = [
+    said: list[Message] = [
         missions.info("a"),
         missions.tracks("a", 0, [1], [(0, 0)]),
         missions.info("b"),
@@ -146,7 +146,7 @@ def test_a_mixture_is_drawn_by_its_moments() -> None:
     means, roots = rng.normal(0, 10, (6, 4)), rng.normal(0, 1, (6, 4, 4))
     covariances = roots @ roots.transpose(0, 2, 1) + np.eye(4)
     mixed = missions.tracks("a", 0, [1, 2, 3], [], means=means, covariances=covariances, counts=counts, weights=weights)
-    mean, covariance = moments(mixed)
+    mean, covariance = track_moments(mixed)
     for track, part in enumerate((slice(0, 2), slice(2, 5), slice(5, 6))):
         w = weights[part]
         second = np.einsum("c,cij->ij", w, covariances[part] + np.einsum("ci,cj->cij", means[part], means[part]))
@@ -194,7 +194,7 @@ def test_what_cannot_be_drawn_is_recorded_counted_and_harms_nothing_else(tmp_pat
     future = missions.tracks("d", 10 * 365 * 86400, [1], [(1, 1)])
     far = missions.tracks("e", 0, [1, 2], [(1e11, 1), (2, 2)], frame=Enu(60.5, 10.0))
     good = missions.tracks("f", 0, [1], [(1, 1)])
-    said = [centre, indefinite, not_finite, elsewhere, future, far, good]
+    said: list[Message] = [centre, indefinite, not_finite, elsewhere, future, far, good]
     path = tmp_path / "a.rrd"
     recorder = record(path, *said)
     assert [raw.data for raw in read(path)] == [encode(message) for message in said]

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from fusion_service import colours
 from fusion_service.recording import Recorder
-from fusion_service.recording.drawing import palette
 from fusion_service.recording.drawing.geometry import Chart, rings
 from schemas import Enu, GlobalTracks, Message, StepLog, encode, global_key, local_key
 from schemas.messages import BROKEN, KEPT, LINKED, MERGED, NO_SOURCE
@@ -85,11 +85,11 @@ def second(said: list[Sent], name: str) -> list[Sent]:
 def test_several_centres_have_colours_and_pictures_of_their_own(tmp_path: Path) -> None:
     said, path = list(mission(10)), tmp_path / "a.rrd"
     fly(path, sorted([*said, *second(said, "again")], key=lambda s: s.received))
-    wanted = palette.centre_colours(["main", "again"])
+    wanted = colours.centre_colours(["main", "again"])
     assert len(set(wanted.values())) == 2
     for name in ("main", "again"):
         packed = static(path, f"/picture/global/{name}/trail")["LineStrips2D:colors"][0]
-        assert packed >> 8 == palette.packed(wanted[name]) >> 8
+        assert packed >> 8 == colours.packed(wanted[name]) >> 8
         assert static(path, f"/anees/{name}/mean")["SeriesLines:colors"][0] >> 8 == packed >> 8
         assert rows(path, f"/picture/global/{name}/links/radar1")
     shown = layout(path)
@@ -98,7 +98,7 @@ def test_several_centres_have_colours_and_pictures_of_their_own(tmp_path: Path) 
     fly(tmp_path / "b.rrd", said)
     assert "main alone" not in layout(tmp_path / "b.rrd")
     packed = static(tmp_path / "b.rrd", "/picture/global/main/trail")["LineStrips2D:colors"][0]
-    assert packed >> 8 == palette.packed(palette.FUSED) >> 8
+    assert packed >> 8 == colours.packed(colours.SCREEN_FUSED) >> 8
 
 
 def layout(path: Path) -> str:

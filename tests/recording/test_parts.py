@@ -14,7 +14,7 @@ from rerun.chunk import RrdReader
 
 from fusion_service.bus import open_bus
 from fusion_service.cli import main
-from fusion_service.commands import units
+from fusion_service.commands import arguments
 from fusion_service.errors import ReviewError
 from fusion_service.recording import Recorder, Rotation, messages, parts, read
 from fusion_service.recording.parts import DEFAULT_SIZE, Folder, is_folder
@@ -308,19 +308,19 @@ def test_a_part_is_free_once_the_next_has_begun(tmp_path: Path, capsys: pytest.C
     ("text", "value"), [("500MB", 5e8), ("1.5 gib", 1.5 * 2**30), ("20GB", 2e10), ("7", 7), ("2k", 2000), (".5kB", 500)]
 )
 def test_sizes(text: str, value: float) -> None:
-    assert units.size(text) == value
+    assert arguments.size(text) == value
 
 
 @pytest.mark.parametrize(
     ("text", "value"), [("90", 90), ("1h", 3600), ("0.5 s", 0.5), ("15min", 900), ("7d", 604800), ("2W", 1209600)]
 )
 def test_durations(text: str, value: float) -> None:
-    assert units.duration(text) == value
+    assert arguments.duration(text) == value
 
 
 @pytest.mark.parametrize("text", ["", "MB", "-1GB", "0", "1e999", "nan", "5 parsecs", "1h30", "9" * 400])
 def test_what_is_no_size_or_duration_is_said_in_one_line(text: str) -> None:
-    for read_it in (units.size, units.duration):
+    for read_it in (arguments.size, arguments.duration):
         with pytest.raises(ValueError, match=r"is not a (size|duration): give a number") as error:
             read_it(text)
         assert "\n" not in str(error.value)

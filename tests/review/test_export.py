@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,7 +88,8 @@ def test_what_goes_out_comes_back(mission: tuple[Path, list[Message]], tmp_path:
     out = tmp_path / f"{what}{suffix}"
     done = export(path, out, what)
     kind = {"global": GlobalTracks, "truth": Truth}.get(what, LocalTracks)
-    sent = [m for m in messages if isinstance(m, kind) and (kind is not LocalTracks or m.source == what)]
+    tables = [m for m in messages if isinstance(m, GlobalTracks | LocalTracks | Truth)]
+    sent = [m for m in tables if isinstance(m, kind) and (kind is not LocalTracks or m.source == what)]
     assert (done.rows, done.times) == (sum(len(m.ids) for m in sent), 6)
     assert done.left_out["that do not decode (not-msgpack)"] == 2
     scenario = table.load(out)
@@ -128,7 +130,8 @@ def test_a_table_says_where_a_track_is_and_what_it_is_made_of(
         place = [float(row[name]) for name in ("latitude", "longitude", "altitude")]
         assert place[2] == pytest.approx(altitude, abs=1e-3)
         assert isinstance(first.frame, Enu)
-        x, y, _ = geodesy.geodetic_to_enu(*place, first.frame)
+        lat, lon, high_up = place
+        x, y, _ = geodesy.geodetic_to_enu(lat, lon, high_up, first.frame)
         assert (float(x), float(y)) == pytest.approx((float(row["x"]), float(row["y"])), abs=1e-3)
 
 
@@ -206,12 +209,12 @@ def test_stone_soup_reads_the_table(mission: tuple[Path, list[Message]], tmp_pat
     reader = generic.CSVGroundTruthReader(
         str(tmp_path / "tracks.csv"), state_vector_fields=SPACE, time_field="time", path_id_field="track_id"
     )
-    paths: dict[str, object] = {}
+    paths: dict[str, Any] = {}
     for _, found in reader.groundtruth_paths_gen():
         paths |= {path.id: path for path in found}
     sent = [m for m in messages if isinstance(m, GlobalTracks) and len(m.ids)]
     assert sorted(paths) == [str(2**32 + k) for k in (1, 2, 3)]
     for k in range(3):
         path_of = paths[str(2**32 + 1 + k)]
-        states = np.array([np.ravel(state.state_vector) for state in path_of], dtype=float)  # type: ignore[attr-defined]
+        states = np.array([np.ravel(state.state_vector) for state in path_of], dtype=float)
         assert np.allclose(states, [m.means[k] for m in sent])

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion_service.colours import FUSED, SOURCES, TRUTH, source_colours
+from fusion_service.colours import PAPER_FUSED, PAPER_TRUTH, SOURCES, source_colours
 from fusion_service.geodesy import enu_to_geodetic, geodetic_to_ecef
 from fusion_service.review.mission_map import mission_map
 from schemas import Disk, Ecef, Enu, Local, Message, Polygon, Sector
@@ -57,7 +57,7 @@ def test_colours_are_fixed_by_name_and_reserved() -> None:
     assert some == source_colours({"camera", "lidar", "radar"}) == source_colours(["lidar", "radar", "camera", "lidar"])
     assert list(some) == ["camera", "lidar", "radar"]
     assert len(set(SOURCES)) == len(SOURCES)
-    assert not {FUSED, TRUTH} & set(SOURCES)
+    assert not {PAPER_FUSED, PAPER_TRUTH} & set(SOURCES)
     assert len(source_colours(map(str, range(30)))) == 30
 
 
@@ -71,14 +71,14 @@ def test_a_map_shows_truth_sources_and_fused_tracks(tmp_path: Path) -> None:
     drawn = pixels(mission_map(mission, tmp_path / "map.png", title="harbour"))
     assert min(drawn.shape[:2]) > 500
     colours = source_colours(["lidar", "radar"])
-    for colour in (*colours.values(), FUSED):
+    for colour in (*colours.values(), PAPER_FUSED):
         assert amount(drawn, colour) > 100
-    grey = amount(drawn, TRUTH, 0.55)
+    grey = amount(drawn, PAPER_TRUTH, 0.55)
     fewer = [message for message in mission if message.source not in ("radar", "world")]
     drawn = pixels(mission_map(fewer, tmp_path / "fewer.png"))
     assert amount(drawn, SOURCES[0]) > 100
     assert amount(drawn, colours["radar"]) == 0
-    assert grey > 20 * amount(drawn, TRUTH, 0.55)
+    assert grey > 20 * amount(drawn, PAPER_TRUTH, 0.55)
 
 
 def test_the_order_of_messages_does_not_matter(tmp_path: Path) -> None:

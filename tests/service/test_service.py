@@ -75,7 +75,10 @@ def test_a_restarted_sensor_takes_over_nobodys_links(scene: Scene) -> None:
     before = scene.seen.confirmed()
     second.kill()
     scene.sensor("r2", 0, 1, 2, order="reversed")
-    newest = lambda: max(int(e) for e in scene.seen.pictures[-1].contributor_epoch)  # noqa: E731
+
+    def newest() -> int:
+        return max(int(epoch) for epoch in scene.seen.pictures[-1].contributor_epoch)
+
     first = newest()
     eventually(lambda: newest() > first)
     eventually(lambda: all(scene.seen.feeders(track) == {"r1", "r2"} for track in before.values()))
@@ -170,7 +173,10 @@ def test_by_message_time_it_steps_when_all_live_sources_have_passed(hub: Hub, tm
             publisher.info(frame=frame, position=(0, 0, 0), period=1.0, motion=schemas.Motion("cv", 1.0))
         scene.service(centre='clock = "message"\nname = "slow"')
         eventually(lambda: len(scene.last_status().sources) == 2 if scene.seen.statuses else False, 15)
-        times = lambda: [(p.time - start) / second for p in scene.seen.pictures]  # noqa: E731
+
+        def times() -> list[float]:
+            return [(picture.time - start) / second for picture in scene.seen.pictures]
+
         send(one, 1.0)
         send(two, 0.3)
         send(two, 0.9)
@@ -208,7 +214,7 @@ def test_a_step_that_fails_does_not_end_the_service(
     stop = threading.Event()
     with open_state(str(scene.folder / "state")) as state, open_bus([scene.endpoint], wait=10.0) as bus:
         service = Service(load_config(path), bus, state)
-        service._centre.restored = True  # type: ignore[attr-defined]
+        service._lasting.centre.restored = True  # type: ignore[attr-defined]
         thread = threading.Thread(target=service.run, args=(stop,))
         thread.start()
         try:
@@ -259,7 +265,7 @@ def test_ctrl_c_ends_everything_at_once(tmp_path: Path) -> None:
     [
         (["run", "--config", "nowhere.toml"], 2, "cannot be read"),
         (["record", "--out", "/proc/nowhere/x.rrd", "--connect", "tcp/127.0.0.1:1"], 1, "fusion-service record:"),
-        (["demo", "--scenario", "moon"], 1, "unknown scenario 'moon'"),
+        (["demo", "--scenario", "moon"], 2, "unknown scenario 'moon'"),
         (["demo", "--scenario", "autoferry:2", "--data", "/nowhere"], 1, "--data names the Autoferry folder"),
     ],
 )

@@ -18,7 +18,7 @@ from fusion_service.service.state import open_state
 with open_state(sys.argv[1]) as state:
     n = 0
     while True:
-        print(state.take_generation(), flush=True)
+        print(state.new_generation(), flush=True)
         state.save(bytes([n % 251]) * 100_000)
         n += 1
 """
@@ -28,20 +28,20 @@ def test_generations_grow_across_starts(tmp_path: Path) -> None:
     taken = []
     for _ in range(4):
         with open_state(str(tmp_path / "deep" / "state")) as state:
-            taken += [state.take_generation(), state.take_generation()]
+            taken += [state.new_generation(), state.new_generation()]
     assert taken == sorted(set(taken))
 
 
 def test_a_lost_folder_does_not_bring_old_generations_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with open_state(str(tmp_path / "one")) as state:
-        first = state.take_generation()
+        first = state.new_generation()
     later = state_module._by_clock() + 5
     monkeypatch.setattr(state_module, "_by_clock", lambda: later)
     with open_state(str(tmp_path / "two")) as state:
-        assert state.take_generation() > first
+        assert state.new_generation() > first
     monkeypatch.setattr(state_module, "_by_clock", lambda: 1)
     with open_state(str(tmp_path / "one")) as state:
-        assert state.take_generation() > first
+        assert state.new_generation() > first
 
 
 def test_killed_at_any_moment_nothing_is_taken_twice_and_the_checkpoint_is_whole(tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ def test_killed_at_any_moment_nothing_is_taken_twice_and_the_checkpoint_is_whole
             assert blob is not None
             assert re.fullmatch(rb"(.)\1*", blob, re.DOTALL)
             assert len(blob) == 100_000
-            printed.append(state.take_generation())
+            printed.append(state.new_generation())
     assert printed == sorted(set(printed))
 
 
@@ -74,12 +74,12 @@ def test_what_is_wrong_is_said(tmp_path: Path) -> None:
         pass
     (tmp_path / "generation").write_text("seven")
     with open_state(str(tmp_path)) as state, pytest.raises(StateError, match="delete it"):
-        state.take_generation()
+        state.new_generation()
 
 
 def test_without_a_folder_generations_still_grow() -> None:
     with open_state(None) as state:
-        assert state.take_generation() < state.take_generation()
+        assert state.new_generation() < state.new_generation()
         assert state.load() is None
         state.save(b"nothing")
 

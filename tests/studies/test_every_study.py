@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import math
-import os
 from pathlib import Path
 
 import pytest
 
+from fusion_service.process import data_folder
 from studies import pictures, report
 from studies.study import Run, Study, catalogue
 
 STUDIES = catalogue()
-DATA = os.environ.get("FUSION_DATA")
+DATA = data_folder("autoferry")
 
 
 @pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)

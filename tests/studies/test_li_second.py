@@ -251,7 +251,13 @@ def test_the_intensities_are_fused_as_by_the_centre(rule: str) -> None:
     for number, report in enumerate(reports):
         head: dict[str, Any] = {"source": f"s{number}", "epoch": 1, "frame": frame}
         info = schemas.SensorInfo(
-            **head, seq=0, sent=0, position=(0.0, 0.0, 0.0), period=1.0, motion=filters.CONFIG.motion
+            **head,
+            seq=0,
+            sent=0,
+            position=(0.0, 0.0, 0.0),
+            period=1.0,
+            motion=filters.CONFIG.motion,
+            coverage=schemas.Disk(1e6),
         )
         centre.handle(info, 0)
         centre.handle(schemas.LocalIntensity(**head, seq=1, sent=time, time=time, **report[k]), time)

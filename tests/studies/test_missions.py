@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 
 import schemas
 from fusion_service.geodesy import transform
+from fusion_service.process import data_folder
 from fusion_service.review.evaluation import Evaluation, evaluate
 from schemas import GlobalTracks, LocalTracks, SensorInfo, Truth
 from sensor_clients.scenarios.three_radars import RADARS, three_radars
@@ -23,7 +23,7 @@ from studies.rules import fuser
 from studies.study import MissingDataError, Result, Run
 
 README = Path(__file__).parents[2] / "README.md"
-DATA = os.environ.get("FUSION_DATA")
+DATA = data_folder("autoferry")
 needs_data = pytest.mark.skipif(not DATA, reason="FUSION_DATA names no folder of the Autoferry recordings")
 
 

@@ -10,15 +10,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
 from fusion_service.recording.columns import entity, import_rerun
+from fusion_service.recording.drawing.extent import Corners
 from schemas import Enu, Frame
 
 __all__ = ["blueprint", "track_blueprint"]
 
-Corners = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 PIXELS = 700
 """What a map of usual size shows of the picture's height."""

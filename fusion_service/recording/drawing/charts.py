@@ -19,10 +19,18 @@ from collections.abc import Callable
 import numpy as np
 
 from fusion_service import metrics
-from fusion_service.recording.columns import Columns, Stamp, entity, import_rerun
-from fusion_service.recording.drawing import palette
-from fusion_service.recording.drawing.errors import Score
-from fusion_service.recording.drawing.geometry import moments
+from fusion_service.colours import (
+    SCREEN_FUSED,
+    SCREEN_NEUTRAL,
+    SCREEN_TRUTH,
+    SCREEN_WARNING,
+    Colour,
+    series_colour,
+    shade,
+)
+from fusion_service.recording.columns import ColumnWriter, Stamp, entity, import_rerun
+from fusion_service.recording.drawing.errors import StepErrors
+from fusion_service.recording.drawing.geometry import track_moments
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks
 from schemas.messages import TENTATIVE
 
@@ -37,13 +45,13 @@ in all. A new part of the recording counts anew."""
 
 
 class Charts:
-    """Turns messages and scores into points of time series, each with its colour and name."""
+    """Turns messages and errors into points of time series, each with its colour and name."""
 
-    def __init__(self, columns: Columns, focus: int | None = None) -> None:
+    def __init__(self, columns: ColumnWriter, focus: int | None = None) -> None:
         self._rr = import_rerun()
         self._columns = columns
         self._focus = focus
-        self._styles: dict[str, tuple[palette.Colour, str, float]] = {}
+        self._styles: dict[str, tuple[Colour, str, float]] = {}
         self._targets: set[int] = set()
         self._series: dict[str, set[int]] = {}
 
@@ -58,9 +66,10 @@ class Charts:
         self._targets.clear()
         self._series.clear()
 
-    def local(self, message: LocalTracks | LocalIntensity, colours: dict[str, palette.Colour], stamp: Stamp) -> None:
+    def local(self, message: LocalTracks | LocalIntensity, colours: dict[str, Colour], stamp: Stamp) -> None:
+        """How many tracks, or objects expected, a source has."""
         path, name = entity("counts", "local", message.source), message.source
-        tone = colours.get(message.source, palette.NEUTRAL)
+        tone = colours.get(message.source, SCREEN_NEUTRAL)
         if isinstance(message, LocalTracks):
             self._add(path, stamp, len(message.ids), tone, name)
         else:
@@ -69,17 +78,17 @@ class Charts:
     def step(
         self,
         message: GlobalTracks,
-        colours: dict[str, palette.Colour],
-        centres: dict[str, palette.Colour],
+        colours: dict[str, Colour],
+        centres: dict[str, Colour],
         label: Callable[[int], str],
         stamp: Stamp,
     ) -> int:
         """Returns how many confirmed tracks have no series of existence, because there are enough."""
-        centre, own = message.source, centres.get(message.source, palette.FUSED)
+        centre, own = message.source, centres.get(message.source, SCREEN_FUSED)
         counts = np.bincount(message.status, minlength=len(STATUSES))
-        tones = (palette.TRUTH, own, palette.WARNING)
-        if own != palette.FUSED:
-            tones = (palette.shade(own, 0.45), own, palette.shade(own, 0.7))
+        tones = (SCREEN_TRUTH, own, SCREEN_WARNING)
+        if own != SCREEN_FUSED:
+            tones = (shade(own, 0.45), own, shade(own, 0.7))
         for name, count, tone in zip(STATUSES, counts.tolist(), tones, strict=True):
             self._add(entity("counts", centre, name), stamp, count, tone, f"{centre}: {name}", 2.0)
         influence = message.contributor_influence
@@ -87,7 +96,7 @@ class Charts:
         number = np.bincount(index, minlength=len(message.sources))
         total = np.bincount(index, weights=influence[np.isfinite(influence)], minlength=len(message.sources))
         for name, n, part in zip(message.sources, number.tolist(), total.tolist(), strict=True):
-            tone = colours.get(name, palette.NEUTRAL)
+            tone = colours.get(name, SCREEN_NEUTRAL)
             self._add(entity("influence", centre, name), stamp, part / n if n else np.nan, tone, name)
         if self._focus is not None:
             self._follow(message, self._focus, colours, own, stamp)
@@ -112,32 +121,32 @@ class Charts:
         self,
         message: GlobalTracks,
         track: int,
-        colours: dict[str, palette.Colour],
-        own: palette.Colour,
+        colours: dict[str, Colour],
+        own: Colour,
         stamp: Stamp,
     ) -> None:
         centre = message.source
         for row in np.flatnonzero(message.ids == np.uint64(track)).tolist():
             self._add(entity("track", centre, "existence"), stamp, float(message.existence[row]), own, "existence", 2.0)
             index = [message.space.index(name) for name in "xyz" if name in message.space]
-            spread = moments(message)[1][row][np.ix_(index, index)]
+            spread = track_moments(message)[1][row][np.ix_(index, index)]
             self._add(
-                entity("track", centre, "sigma"), stamp, float(np.sqrt(np.trace(spread))), palette.NEUTRAL, "sigma"
+                entity("track", centre, "sigma"), stamp, float(np.sqrt(np.trace(spread))), SCREEN_NEUTRAL, "sigma"
             )
             first = int(message.contributor_counts[:row].sum())
             contributions = slice(first, first + int(message.contributor_counts[row]))
             which = message.contributor_source[contributions].tolist()
             shares = dict(zip(which, message.contributor_influence[contributions].tolist(), strict=True))
             for number, name in enumerate(message.sources):
-                path, tone = entity("track", centre, "influence", name), colours.get(name, palette.NEUTRAL)
+                path, tone = entity("track", centre, "influence", name), colours.get(name, SCREEN_NEUTRAL)
                 if number in shares or path in self._styles:
                     self._add(path, stamp, shares.get(number, np.nan), tone, name, 2.0)
 
-    def score(self, score: Score, centres: dict[str, palette.Colour]) -> int:
+    def errors(self, found: StepErrors, centres: dict[str, Colour]) -> int:
         """Returns how many targets have no series, because there are enough."""
-        centre, stamp, left_out = score.centre, score.stamp, 0
-        own = centres.get(centre, palette.FUSED)
-        for target, error, nees in zip(score.ids.tolist(), score.error.tolist(), score.nees.tolist(), strict=True):
+        centre, stamp, left_out = found.centre, found.stamp, 0
+        own = centres.get(centre, SCREEN_FUSED)
+        for target, error, nees in zip(found.ids.tolist(), found.error.tolist(), found.nees.tolist(), strict=True):
             if target not in self._targets and len(self._targets) >= MAX_SERIES:
                 left_out += 1
                 continue
@@ -145,29 +154,27 @@ class Charts:
             tone, name = _tone(target), f"target {target}"
             self._add(entity("error", centre, str(target)), stamp, error, tone, name)
             self._add(entity("nees", centre, str(target)), stamp, nees, tone, name)
-        single = metrics.nees_bounds(score.dimension, 1)
-        charts = [("nees", single), ("anees", score.bounds)]
+        single = metrics.nees_bounds(found.dimension, 1)
+        charts = [("nees", single), ("anees", found.bounds)]
         for path, (low, high) in charts:
             self._bounds(entity(path, centre, "bounds"), (low, high), stamp)
-        mean = float(np.nanmean(score.nees)) if score.assigned else np.nan
+        mean = float(np.nanmean(found.nees)) if found.assigned else np.nan
         name = "mean NEES" if len(centres) < 2 else f"{centre}: mean NEES"
         self._add(entity("anees", centre, "mean"), stamp, mean, own, name, 2.5)
         if self._focus is not None:
-            for row in np.flatnonzero(score.tracks == np.uint64(self._focus)).tolist():
-                name = f"to target {int(score.ids[row])}"
-                path = entity("track", centre, "error", str(int(score.ids[row])))
-                self._add(path, stamp, float(score.error[row]), own, name, 2.0)
-                self._add(entity("track", centre, "nees", "track"), stamp, float(score.nees[row]), own, "NEES", 2.0)
+            for row in np.flatnonzero(found.tracks == np.uint64(self._focus)).tolist():
+                name = f"to target {int(found.ids[row])}"
+                path = entity("track", centre, "error", str(int(found.ids[row])))
+                self._add(path, stamp, float(found.error[row]), own, name, 2.0)
+                self._add(entity("track", centre, "nees", "track"), stamp, float(found.nees[row]), own, "NEES", 2.0)
                 self._bounds(entity("track", centre, "nees", "bounds"), single, stamp)
         return left_out
 
     def _bounds(self, path: str, limits: tuple[float, float], stamp: Stamp) -> None:
         for name, value in zip(("low", "high"), limits, strict=True):
-            self._add(f"{path}/{name}", stamp, value, palette.NEUTRAL, f"95 % {name}", 2.0)
+            self._add(f"{path}/{name}", stamp, value, SCREEN_NEUTRAL, f"95 % {name}", 2.0)
 
-    def _add(
-        self, path: str, stamp: Stamp, value: float, colour: palette.Colour, name: str, width: float = 1.25
-    ) -> None:
+    def _add(self, path: str, stamp: Stamp, value: float, colour: Colour, name: str, width: float = 1.25) -> None:
         style = (colour, name, width)
         if self._styles.get(path) != style:
             self._styles[path] = style
@@ -175,6 +182,6 @@ class Charts:
         self._columns.scalar(path, stamp, value)
 
 
-def _tone(number: int) -> palette.Colour:
+def _tone(number: int) -> Colour:
     """Of a track or target, by its counter."""
-    return palette.series_colour(number % (1 << 16))
+    return series_colour(number % (1 << 16))

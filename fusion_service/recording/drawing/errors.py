@@ -16,13 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, metrics
+from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import Stamp
-from fusion_service.recording.drawing.geometry import moments
+from fusion_service.recording.drawing.geometry import track_moments
 from schemas import STATUSES, GlobalTracks, Truth
 
-__all__ = ["Assessment", "Score"]
+__all__ = ["StepErrors", "TruthMatcher"]
 
-Floats = NDArray[np.float64]
 
 HELD = 512
 """Truth messages of a scenario, and global steps of a centre, that wait for each other."""
@@ -33,7 +33,7 @@ SMALLEST = 20.0
 """Without a given cut-off: so many typical standard deviations of the position, and at least so many metres."""
 
 
-class Score(NamedTuple):
+class StepErrors(NamedTuple):
     """One global step of `centre`: for each true object (T,) the distance (m) and NEES / dimension of the track
     that is assigned to it, NaN without one, and the track's id (0: none); `bounds`: where the mean NEES lies with 95 %
     for a consistent centre."""
@@ -41,21 +41,23 @@ class Score(NamedTuple):
     centre: str
     stamp: Stamp
     ids: NDArray[np.uint64]
-    error: Floats
-    nees: Floats
+    error: FloatArray
+    nees: FloatArray
     dimension: int
     tracks: NDArray[np.uint64]
 
     @property
     def assigned(self) -> int:
+        """How many true objects have a track."""
         return int(np.isfinite(self.nees).sum())
 
     @property
     def bounds(self) -> tuple[float, float]:
+        """Of the mean NEES over its dimension; NaN where no object has a track."""
         return metrics.nees_bounds(self.dimension, self.assigned) if self.assigned else (np.nan, np.nan)
 
 
-class Assessment:
+class TruthMatcher:
     """Matches global steps with truth as both come, in any order. `cutoff`: m, None chooses one for each step."""
 
     def __init__(self, cutoff: float | None = None) -> None:
@@ -64,6 +66,7 @@ class Assessment:
         self._steps: deque[tuple[GlobalTracks, Stamp]] = deque(maxlen=HELD)
 
     def truth(self, message: Truth) -> None:
+        """Truth, as it comes; a new epoch takes the place of the old one."""
         held = self._truth.setdefault(message.source, [])
         if held and held[-1].epoch != message.epoch:
             held.clear()
@@ -71,12 +74,13 @@ class Assessment:
         del held[:-HELD]
 
     def step(self, message: GlobalTracks, stamp: Stamp) -> None:
+        """A global step, as it comes; its errors are told at `stamp`."""
         self._steps.append((message, stamp))
         held = sum(len(one.ids) for one, _ in self._steps)
         while held > HELD_TRACKS and len(self._steps) > 1:
             held -= len(self._steps.popleft()[0].ids)
 
-    def scores(self) -> Iterator[Score]:
+    def matched(self) -> Iterator[StepErrors]:
         """Every step whose time the truth has reached; the others wait for it. `geodesy.FrameError` where the
         truth has no place in the frame of the tracks: that step is left out."""
         waiting = list(self._steps)
@@ -97,10 +101,15 @@ class Assessment:
                     yield self._score(message, stamp, *found)
 
     def _score(
-        self, message: GlobalTracks, stamp: Stamp, ids: NDArray[np.uint64], positions: Floats, names: tuple[str, ...]
-    ) -> Score:
+        self,
+        message: GlobalTracks,
+        stamp: Stamp,
+        ids: NDArray[np.uint64],
+        positions: FloatArray,
+        names: tuple[str, ...],
+    ) -> StepErrors:
         index = [message.space.index(name) for name in names]
-        means, covariances = moments(message)
+        means, covariances = track_moments(message)
         shown = np.flatnonzero(message.status != STATUSES.index("tentative"))
         means, covariances = means[shown][:, index], covariances[shown][:, index][:, :, index]
         sound = np.isfinite(means).all(axis=1) & (np.linalg.det(covariances) > 0)
@@ -116,10 +125,12 @@ class Assessment:
         nees[found] = metrics.nees(apart, covariances[assignment[found]]) / len(names)
         tracks = np.zeros(len(ids), dtype=np.uint64)
         tracks[found] = message.ids[shown[assignment[found]]]
-        return Score(message.source, stamp, ids, error, nees, len(names), tracks)
+        return StepErrors(message.source, stamp, ids, error, nees, len(names), tracks)
 
 
-def _truth_at(held: list[Truth], message: GlobalTracks) -> tuple[NDArray[np.uint64], Floats, tuple[str, ...]] | None:
+def _truth_at(
+    held: list[Truth], message: GlobalTracks
+) -> tuple[NDArray[np.uint64], FloatArray, tuple[str, ...]] | None:
     """Ids (T,), positions (T, d) in the frame of `message` at its time, and the names of the components; None
     where the truth does not reach around that time."""
     after = bisect_left(held, message.time, key=lambda item: item.time)
@@ -136,7 +147,7 @@ def _truth_at(held: list[Truth], message: GlobalTracks) -> tuple[NDArray[np.uint
     return ids, positions, names
 
 
-def _positions(truth: Truth, message: GlobalTracks) -> tuple[NDArray[np.uint64], Floats, tuple[str, ...]]:
+def _positions(truth: Truth, message: GlobalTracks) -> tuple[NDArray[np.uint64], FloatArray, tuple[str, ...]]:
     own = tuple(name for name in "xyz" if name in truth.space)
     index = [truth.space.index(name) for name in own]
     nothing = np.zeros((len(truth.ids), len(own), len(own)))

@@ -14,49 +14,58 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy
-from schemas import Disk, Ecef, Enu, Frame, Height, LocalIntensity, Polygon, Sector, SensorInfo
-from schemas.messages import GlobalTracks, LocalTracks
+from fusion_service.densities import moments
+from fusion_service.linalg import FloatArray
+from schemas import Disk, Ecef, Enu, Frame, GlobalTracks, Height, LocalTracks, Polygon, Sector, SensorInfo
 
-__all__ = ["RING", "Chart", "Outline", "Place", "ellipses", "grid", "moments", "outline", "rings"]
+__all__ = [
+    "CORNERS",
+    "QUANTILE",
+    "RING",
+    "Chart",
+    "Outline",
+    "Place",
+    "circle",
+    "ellipses",
+    "grid",
+    "outline",
+    "rings",
+    "track_moments",
+]
 
-Floats = NDArray[np.float64]
-Tracks = LocalTracks | GlobalTracks
 
 QUANTILE = -2 * math.log(0.05)
+"""A Gaussian's position lies inside (p - mean)' P^-1 (p - mean) = QUANTILE with 95 %."""
 CORNERS = 24
-RING = np.stack([f(np.linspace(0, 2 * np.pi, CORNERS + 1)) for f in (np.cos, np.sin)])
+
+
+def circle(corners: int = CORNERS) -> FloatArray:
+    """Points (2, corners + 1) of the unit circle, the last one the first again."""
+    return np.stack([f(np.linspace(0, 2 * np.pi, corners + 1)) for f in (np.cos, np.sin)])
+
+
+RING = circle()
 
 
 class Place(NamedTuple):
     """Positions in a chart: xy (T, 2) east and north in m, z (T,) up, covariance (T, 2, 2) of xy."""
 
-    xy: Floats
-    z: Floats
-    covariance: Floats
+    xy: FloatArray
+    z: FloatArray
+    covariance: FloatArray
 
 
 class Outline(NamedTuple):
     """S line strips, one after the other: xy (P, 2) in m, their lengths (S,) and whose they are (S,)."""
 
-    xy: Floats
+    xy: FloatArray
     lengths: NDArray[np.int64]
     owner: NDArray[np.int64]
 
 
-def moments(message: Tracks | LocalIntensity) -> tuple[Floats, Floats]:
-    """Mean (T, n) and covariance (T, n, n) of each track: a mixture by its moments, an intensity by component."""
-    means, covariances = message.means, message.covariances
-    if isinstance(message, LocalIntensity) or message.counts is None or message.weights is None:
-        return means, covariances
-    counts = message.counts.astype(np.intp)
-    if not len(counts):
-        return means[:0], covariances[:0]
-    starts, owner = np.cumsum(counts) - counts, np.repeat(np.arange(len(counts)), counts)
-    weights = message.weights
-    mean = np.add.reduceat(weights[:, None] * means, starts)
-    apart = means - mean[owner]
-    spread = covariances + apart[:, :, None] * apart[:, None, :]
-    return mean, np.add.reduceat(weights[:, None, None] * spread, starts)
+def track_moments(message: LocalTracks | GlobalTracks) -> tuple[FloatArray, FloatArray]:
+    """Mean (T, n) and covariance (T, n, n) of each track: a mixture by its moments."""
+    return moments(message.means, message.covariances, message.weights, message.counts)
 
 
 class Chart:
@@ -69,7 +78,12 @@ class Chart:
         self.frame = frame
 
     def place(
-        self, means: Floats, covariances: Floats, space: tuple[str, ...], frame: Frame, height: Height | None = None
+        self,
+        means: FloatArray,
+        covariances: FloatArray,
+        space: tuple[str, ...],
+        frame: Frame,
+        height: Height | None = None,
     ) -> Place:
         """Positions of states (T, n), (T, n, n). Raises `geodesy.FrameError` if `frame` has none."""
         names = tuple(name for name in "xyz" if name in space)
@@ -85,11 +99,11 @@ class Chart:
             z = (height.value if height else 0.0) - origin - (xy * xy).sum(axis=1) / (2 * geodesy.A)
         return Place(xy, z, covariances[:, :2, :2])
 
-    def plane(self, xy: Floats) -> Floats:
+    def plane(self, xy: FloatArray) -> FloatArray:
         """(..., 2) as a 2D view draws it."""
         return xy * (1.0, -1.0)
 
-    def geo(self, xy: Floats, z: Floats) -> Floats | None:
+    def geo(self, xy: FloatArray, z: FloatArray) -> FloatArray | None:
         """Latitude and longitude (..., 2) in degrees, None in a frame that is not about a place on Earth."""
         if not isinstance(self.frame, Enu):
             return None
@@ -116,7 +130,7 @@ def ellipses(place: Place, dashed: NDArray[np.bool_], corners: int = CORNERS) ->
     )
 
 
-def outline(info: SensorInfo) -> tuple[list[Floats], Frame]:
+def outline(info: SensorInfo) -> tuple[list[FloatArray], Frame]:
     """The edges of a sensor's field of view as (P, 2) strips of x, y in m, and the frame they are in."""
     frame, centre = info.frame, np.array(info.position[:2])
     if isinstance(info.coverage, Polygon):
@@ -127,7 +141,7 @@ def outline(info: SensorInfo) -> tuple[list[Floats], Frame]:
     return [centre + edge for edge in _edges(info.coverage)], frame
 
 
-def _edges(coverage: Disk | Sector | None) -> list[Floats]:
+def _edges(coverage: Disk | Sector | None) -> list[FloatArray]:
     """As seen from the sensor."""
     if coverage is None:
         return []
@@ -136,13 +150,13 @@ def _edges(coverage: Disk | Sector | None) -> list[Floats]:
     return [_sector(coverage)]
 
 
-def _arc(radius: float, azimuth: float, width: float) -> Floats:
+def _arc(radius: float, azimuth: float, width: float) -> FloatArray:
     """Points at `radius` from `azimuth` on through `width` clockwise."""
     angles = azimuth + np.linspace(0.0, width, max(2, math.ceil(abs(width) / math.radians(4)) + 1))
     return radius * np.stack([np.sin(angles), np.cos(angles)], axis=-1)
 
 
-def _sector(sector: Sector) -> Floats:
+def _sector(sector: Sector) -> FloatArray:
     half = sector.width / 2
     outer = _arc(sector.radius, sector.azimuth - half, sector.width)
     inner = _arc(sector.inner, sector.azimuth + half, -sector.width)
@@ -163,7 +177,7 @@ def _round(size: float) -> float:
     return step * next(f for f in (1, 2, 5, 10) if size / (f * step) <= 8)
 
 
-def grid(low: Floats, high: Floats) -> tuple[list[Floats], list[str]]:
+def grid(low: FloatArray, high: FloatArray) -> tuple[list[FloatArray], list[str]]:
     """Lines every round number of metres over the square `low`..`high` (2,) of east and north, and their labels."""
     step = _round(float(np.max(high - low)))
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step

@@ -1,16 +1,22 @@
-"""The short names of global ids that a recording shows: 7, 2.7."""
+"""How a recording writes ids and times: the short names of global ids, 7 or 2.7, and UTC to the second."""
 
 from __future__ import annotations
 
 import re
+from datetime import UTC, datetime
 
 from schemas import GlobalTracks
 
-__all__ = ["Labels"]
+__all__ = ["Labels", "utc"]
 
 COUNTERS = 1 << 32
 MAX_GENERATIONS = 1000
 """Runs of services that are numbered; those beyond are called by their generation."""
+
+
+def utc(time: int, between: str = " ") -> str:
+    """`time`, ns UTC, as ISO 8601 to the second, with `between` date and time."""
+    return datetime.fromtimestamp(time // 10**9, UTC).strftime(f"%Y-%m-%d{between}%H:%M:%SZ")
 
 
 class Labels:

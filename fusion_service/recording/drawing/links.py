@@ -12,15 +12,22 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.linalg import FloatArray
+from fusion_service.recording.columns import entity
 from fusion_service.recording.drawing.tables import Table
 from schemas import GlobalTracks
 
-__all__ = ["links"]
-
-Floats = NDArray[np.float64]
+__all__ = ["links", "links_path"]
 
 
-def links(message: GlobalTracks, fused: Table, local: Mapping[str, Table]) -> Iterator[tuple[str, Floats, Floats]]:
+def links_path(centre: str, source: str) -> str:
+    """The entity of the lines from the tracks of `source` to those of `centre`."""
+    return entity("picture", "global", centre, "links", source)
+
+
+def links(
+    message: GlobalTracks, fused: Table, local: Mapping[str, Table]
+) -> Iterator[tuple[str, FloatArray, FloatArray]]:
     """Of each source of `message`: its name, ends (S, 2, 2) in m, local track first, and their heights (S, 2).
 
     fused: the global tracks that are drawn; local: those of each source.

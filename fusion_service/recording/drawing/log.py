@@ -13,12 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.recording.columns import Columns, Stamp, documents, entity, texts
-from fusion_service.recording.drawing.drawing import Drawing
+from fusion_service.recording.columns import ColumnWriter, Stamp, documents, entity, texts
+from fusion_service.recording.drawing.labels import utc
+from fusion_service.recording.drawing.tracks import Drawing
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import DECISIONS, KEPT, NO_SOURCE
 
-__all__ = ["Journal"]
+__all__ = ["EventLog"]
 
 INFO, WARN = "INFO", "WARN"
 WAITING = 1000
@@ -29,10 +30,10 @@ SAID_ELSEWHERE = ("found", "lost", "restarted")
 """Events of a service that its status, or the epoch of the messages, shows as well."""
 
 
-class Journal:
+class EventLog:
     """Turns messages into lines; repeats of one fault within a message become one line with a number."""
 
-    def __init__(self, columns: Columns, drawing: Drawing, focus: int | None = None) -> None:
+    def __init__(self, columns: ColumnWriter, drawing: Drawing, focus: int | None = None) -> None:
         self._columns = columns
         self._focus = focus
         self._label = drawing.label
@@ -64,10 +65,11 @@ class Journal:
         if len(self._epochs) > KNOWN:
             del self._epochs[next(iter(self._epochs))]
         verb = "appears" if before is None else "has been started again"
-        self.say(f"{kind}s", INFO if before is None else WARN, f"{kind} {name} {verb} (epoch {_utc(epoch)})", stamp)
+        self.say(f"{kind}s", INFO if before is None else WARN, f"{kind} {name} {verb} (epoch {utc(epoch)})", stamp)
         return True
 
     def alive(self, scope: str, name: str, alive: bool, stamp: Stamp) -> None:
+        """A liveliness token came or went."""
         kind = "source" if scope == "local" else "service"
         text = f"{kind} {name} {'is on the bus' if alive else 'has left the bus'}"
         self.say(f"{kind}s", INFO if alive else WARN, text, stamp)
@@ -137,10 +139,6 @@ def _state(said: dict[str, Any]) -> str:
 
 def _short(value: Any) -> str:
     return f"{len(value)} bytes" if isinstance(value, bytes) else str(value)[:120]
-
-
-def _utc(time: int) -> str:
-    return datetime.fromtimestamp(time // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
 
 
 def _clock(time: int) -> str:

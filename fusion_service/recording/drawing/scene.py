@@ -11,11 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy
-from fusion_service.recording.columns import Columns, Stamp
+from fusion_service.recording.columns import ColumnWriter, Stamp
 from fusion_service.recording.drawing.charts import Charts
-from fusion_service.recording.drawing.drawing import Drawing
-from fusion_service.recording.drawing.errors import Assessment
-from fusion_service.recording.drawing.log import Journal
+from fusion_service.recording.drawing.errors import TruthMatcher
+from fusion_service.recording.drawing.log import EventLog
+from fusion_service.recording.drawing.tracks import Drawing
 from schemas import (
     FAULTS,
     Frame,
@@ -30,7 +30,7 @@ from schemas import (
     check_numbers,
 )
 
-__all__ = ["Scene"]
+__all__ = ["MAX_SOURCES", "PATIENCE", "Scene"]
 
 log = logging.getLogger(__name__)
 
@@ -56,16 +56,18 @@ Drawable = LocalTracks | LocalIntensity | GlobalTracks | SensorInfo | Truth
 class Scene:
     """What a recording shows, written as rows of `columns`. `undrawn`: tracks or messages left out, by reason."""
 
-    def __init__(self, columns: Columns, frame: Frame | None, cutoff: float | None, focus: int | None = None) -> None:
+    def __init__(
+        self, columns: ColumnWriter, frame: Frame | None, cutoff: float | None, focus: int | None = None
+    ) -> None:
         self.drawing = Drawing(columns, frame, focus)
-        self.journal = Journal(columns, self.drawing, focus)
+        self.event_log = EventLog(columns, self.drawing, focus)
         self.crowded = False
         """Whether charts have so many series that a legend would hide them."""
         self.now: int | None = None
         self._start: int | None = None
         self.undrawn: Counter[str] = Counter()
         self._charts = Charts(columns, focus)
-        self._assessment = Assessment(cutoff)
+        self._matcher = TruthMatcher(cutoff)
         self._by_centre = False
         self._new: list[tuple[Message, Stamp]] = []
         self._said: set[tuple[str, str]] = set()
@@ -103,7 +105,7 @@ class Scene:
 
     def alive(self, scope: str, name: str, alive: bool, stamp: Stamp) -> None:
         """A liveliness token came or went."""
-        self.journal.alive(scope, name, alive, stamp)
+        self.event_log.alive(scope, name, alive, stamp)
         if not alive and scope == "local" and stamp.time is not None:
             self.drawing.clear(name, stamp)
 
@@ -126,10 +128,10 @@ class Scene:
                 self._draw_one(message, fault == 0, stamp)
         if drawn:
             with self._guard("truth", drawn[-1][1]._replace(time=self.now)):
-                for score in self._assessment.scores():
-                    over = self._charts.score(score, self.drawing.centres)
+                for found in self._matcher.matched():
+                    over = self._charts.errors(found, self.drawing.centres)
                     if over:
-                        self._leave_out(score.centre, "too many targets", over, score.stamp)
+                        self._leave_out(found.centre, "too many targets", over, found.stamp)
         self.drawing.colour_sources()
         if self.crowded != self._charts.crowded:
             self.crowded = self.drawing.changed = True
@@ -161,26 +163,26 @@ class Scene:
         return ""
 
     def _draw_one(self, message: Message, sound: NDArray[np.bool_], stamp: Stamp) -> None:
-        drawing, charts, journal = self.drawing, self._charts, self.journal
+        drawing, charts, event_log = self.drawing, self._charts, self.event_log
         if isinstance(message, LocalTracks | LocalIntensity | SensorInfo):
-            journal.begin("source", message.source, message.epoch, stamp)
+            event_log.begin("source", message.source, message.epoch, stamp)
         elif isinstance(message, GlobalTracks | Status):
-            journal.begin("service", message.source, message.epoch, stamp)
+            event_log.begin("service", message.source, message.epoch, stamp)
         if isinstance(message, Status):
-            for source in journal.status(message, stamp):
+            for source in event_log.status(message, stamp):
                 drawing.clear(source, stamp)
         elif isinstance(message, StepLog):
-            journal.step(message, stamp)
+            event_log.step(message, stamp)
         elif isinstance(message, SensorInfo):
             drawing.sensor(message, stamp)
         elif isinstance(message, Truth):
             if self._assessable(message, stamp):
-                self._assessment.truth(message)
+                self._matcher.truth(message)
             drawing.truth(message, stamp)
         elif isinstance(message, GlobalTracks):
-            journal.tracks(message, stamp)
+            event_log.tracks(message, stamp)
             if self._assessable(message, stamp):
-                self._assessment.step(message, stamp)
+                self._matcher.step(message, stamp)
             if drawing.chart is not None:
                 self._too_many(message, "components", drawing.global_tracks(message, sound, stamp), stamp)
             unseen = charts.step(message, drawing.colours, drawing.centres, drawing.label, stamp)
@@ -221,7 +223,7 @@ class Scene:
         self.undrawn[reason] += count
         if (source, reason) not in self._said and len(self._said) < MAX_SOURCES:
             self._said.add((source, reason))
-            self.journal.say("recorder", "WARN", f"{source}: {count} not drawn: {reason} (said once)", stamp)
+            self.event_log.say("recorder", "WARN", f"{source}: {count} not drawn: {reason} (said once)", stamp)
 
 
 def _needs_chart(message: Message) -> bool:

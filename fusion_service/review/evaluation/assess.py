@@ -30,27 +30,25 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service.coverage import covers
+from fusion_service.linalg import FloatArray
 from fusion_service.metrics import DENSE
-from fusion_service.review.evaluation.consistency import Agreement, Consistency
-from fusion_service.review.evaluation.ground import (
-    Ground,
+from fusion_service.review.evaluation.consistency import Consistency, SourceAgreement
+from fusion_service.review.evaluation.fusion_gain import fusion_gain
+from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.evaluation.reference import (
     NothingToScoreError,
+    Reference,
     ScoredTruth,
     all_times,
-    lay_ground,
+    reference_for,
     scored_truth,
 )
-from fusion_service.review.evaluation.logbook import Logbook
 from fusion_service.review.evaluation.scoring import Scores, Tally, plain
-from fusion_service.review.evaluation.shared import shared_pairs
-from fusion_service.review.snapshots import Block, Follower
+from fusion_service.review.snapshots import Block, ShownTracks, Times, TrackMessage
 from schemas import Frame, GlobalTracks, LocalTracks, Message, Motion, Truth
 
 __all__ = ["Assessment", "Evaluation", "NothingToScoreError", "assess", "evaluate"]
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
-Tracks = LocalTracks | GlobalTracks
 
 BLOCK = 32
 """Times scored at once."""
@@ -84,7 +82,7 @@ class Evaluation:
     shared: dict[str, dict[str, Any]]
     left_out: dict[str, str]
     begins: NDArray[np.int64]
-    confirm: Floats
+    confirm: FloatArray
 
     def as_json(self, scenario: str, rule: str, recording: str) -> dict[str, Any]:
         """The summary as plain values, ready for `json.dumps`."""
@@ -130,7 +128,7 @@ class Assessment:
 
     book: Logbook
     evaluations: dict[str, Evaluation]
-    agreements: dict[str, Agreement]
+    agreements: dict[str, SourceAgreement]
     unscored: str | None
     c: float
     chosen: bool
@@ -162,9 +160,9 @@ def evaluate(
     if centre is None and len(book.centres) > 1:
         raise NothingToScoreError(f"tracks of several centres ({', '.join(book.centres)}): say which one to score")
     centres = [centre] if centre else book.centres
-    ground = lay_ground(book, centres, frame, space, motion, c)
-    scored = scored_truth(book.truths, ground, book.times(centres) if centres else None, every, gap)
-    found, _, _ = _walk(book, ground, scored, scored.times)
+    reference = reference_for(book, centres, frame, space, motion, c)
+    scored = scored_truth(book.truths, reference, book.times(centres) if centres else None, every, gap)
+    found, _, _ = _walk(book, reference, scored, scored.times)
     return found[centres[0] if centres else ""]
 
 
@@ -186,20 +184,20 @@ def assess(
     interval of the fastest. Raises `NothingToScoreError` where there are no tracks."""
     chosen = c is None
     names = list(centres) or book.centres
-    frame, space = (book.ground() if not names else None) or (None, None)
+    frame, space = (book.default_space() if not names else None) or (None, None)
     if not names:
         intervals = [book.traffic["local", name].interval for name in book.sources]
         every = every or min((interval for interval in intervals if interval > 0), default=1.0)
-    ground = lay_ground(book, names, frame, space, motion, c or book.cutoff(SPREADS))
+    reference = reference_for(book, names, frame, space, motion, c or book.cutoff(SPREADS))
     at = book.times(names) if names else None
     try:
-        scored, unscored = scored_truth(truths or book.truths, ground, at, every, gap), None
+        scored, unscored = scored_truth(truths or book.truths, reference, at, every, gap), None
     except ValueError as error:
         scored, unscored = None, str(error)
     if truths and not scored:
         raise NothingToScoreError(f"the given truth does not go with this mission: {unscored}")
     times = scored.times if scored else all_times(book, at, every)
-    found, agreements, sample = _walk(book, ground, scored, times, progress, rows)
+    found, agreements, sample = _walk(book, reference, scored, times, progress, rows)
     if rows and scored:
         told = sorted(truths or book.truths, key=lambda truth: truth.time)
         sample += told[:: max(1, sum(len(truth.ids) for truth in told) // rows)]
@@ -208,7 +206,7 @@ def assess(
         evaluations=found,
         agreements=agreements,
         unscored=unscored,
-        c=ground.c,
+        c=reference.c,
         chosen=chosen,
         sample=sample,
     )
@@ -216,40 +214,42 @@ def assess(
 
 def _walk(
     book: Logbook,
-    ground: Ground,
+    reference: Reference,
     scored: ScoredTruth | None,
     times: Times,
     progress: Callable[[float], None] = lambda _: None,
     rows: int = 0,
-) -> tuple[dict[str, Evaluation], dict[str, Agreement], list[Message]]:
+) -> tuple[dict[str, Evaluation], dict[str, SourceAgreement], list[Message]]:
     """Once through the tracks, block by block of `times`: evaluations and agreements by centre, a thinned mission."""
-    followers = {
-        key: Follower(ground.limits[key], ground.motions[key], ground.frame, ground.axes, ground.speeds)
-        for key in ground.motions
+    shown_tracks = {
+        key: ShownTracks(
+            reference.limits[key], reference.motions[key], reference.frame, reference.axes, reference.speeds
+        )
+        for key in reference.motions
     }
-    agreements = {name: Consistency(ground.sources, len(ground.axes)) for name in ground.centres}
-    score = _Score(book, ground, scored) if scored else None
-    thin = _Thin(book, ground, rows)
-    stream = book.tracks(lambda kind, name: (kind, name) in followers)
+    agreements = {name: Consistency(reference.sources, len(reference.axes)) for name in reference.centres}
+    score = _Score(book, reference, scored) if scored else None
+    thin = _Thin(book, reference, rows)
+    stream = book.tracks(lambda kind, name: (kind, name) in shown_tracks)
     ahead = next(stream, None)
     for begin in range(0, len(times), BLOCK):
         block = times[begin : begin + BLOCK]
-        came: dict[tuple[str, str], list[Tracks]] = {key: [] for key in followers}
+        came: dict[tuple[str, str], list[TrackMessage]] = {key: [] for key in shown_tracks}
         while ahead is not None and ahead.time <= block[-1]:
             key = ("local" if isinstance(ahead, LocalTracks) else "global", ahead.source)
             came[key].append(ahead)
             thin.add(key, ahead)
             ahead = next(stream, None)
         for key, messages in came.items():
-            followers[key].take(messages)
-        shown = {key: follower.show(block) for key, follower in followers.items()}
+            shown_tracks[key].add(messages)
+        shown = {key: one.show(block) for key, one in shown_tracks.items()}
         if score:
             score.add(
                 begin,
                 {key: one for key, (one, _) in shown.items()},
                 {key: pictures for key, (_, pictures) in shown.items() if key[0] == "global"},
             )
-        local = {name: (followers["local", name].numbers, shown["local", name][0]) for name in ground.sources}
+        local = {name: (shown_tracks["local", name].numbers, shown["local", name][0]) for name in reference.sources}
         for name, agreement in agreements.items():
             agreement.add(shown["global", name][1], local)
         progress(min(1.0, (begin + BLOCK) / len(times)))
@@ -260,15 +260,17 @@ def _walk(
 class _Score:
     """The scores of all, gathered block by block."""
 
-    def __init__(self, book: Logbook, ground: Ground, truth: ScoredTruth) -> None:
-        self._ground, self._truth, self._infos = ground, truth, book.infos
+    def __init__(self, book: Logbook, reference: Reference, truth: ScoredTruth) -> None:
+        self._reference, self._truth, self._infos = reference, truth, book.infos
         self._exists = np.isfinite(truth.states[:, :, 0])
         count, targets = self._exists.shape
-        self._tallies = {key: Tally(truth.times, truth.states, len(ground.axes), ground.c) for key in ground.motions}
-        self._alone = None if ground.centres else Tally(truth.times, truth.states, len(ground.axes), ground.c)
+        self._tallies = {
+            key: Tally(truth.times, truth.states, len(reference.axes), reference.c) for key in reference.motions
+        }
+        self._alone = None if reference.centres else Tally(truth.times, truth.states, len(reference.axes), reference.c)
         self._seen = np.zeros((count, targets), dtype=np.int16)
         self._begins = np.full(targets, -1)
-        self._confirmed = {name: np.full(targets, -1) for name in ground.centres}
+        self._confirmed = {name: np.full(targets, -1) for name in reference.centres}
 
     def add(
         self,
@@ -276,7 +278,7 @@ class _Score:
         blocks: dict[tuple[str, str], Block],
         pictures: dict[tuple[str, str], list[GlobalTracks | None]],
     ) -> None:
-        d = len(self._ground.axes)
+        d = len(self._reference.axes)
         count = min(BLOCK, len(self._truth.times) - begin)
         for row in range(count):
             k = begin + row
@@ -288,20 +290,20 @@ class _Score:
                 if key[0] == "local":
                     self._seen[k] += tally.assigned(k)
             if self._alone:
-                self._alone.add(k, there, tree, _nothing(d + len(self._ground.speeds), d), 0)
+                self._alone.add(k, there, tree, _nothing(d + len(self._reference.speeds), d), 0)
             self._note_first(k, there, places)
             for key, shown in pictures.items():
                 picture = shown[row]
                 if picture is not None:
                     self._tallies[key].expect(k, float(picture.existence.sum()))
 
-    def _note_first(self, k: int, there: NDArray[np.intp], places: Floats) -> None:
+    def _note_first(self, k: int, there: NDArray[np.intp], places: FloatArray) -> None:
         known = self._seen[k] > 0
         unknown = there[(self._begins[there] < 0) & ~known[there]]
         if len(unknown):
             where = self._truth.states[k, unknown, : places.shape[1]].T
             for info in self._infos.values():
-                known[unknown] |= covers(info, where, self._ground.frame)
+                known[unknown] |= covers(info, where, self._reference.frame)
         self._begins[(self._begins < 0) & known] = k
         for name, confirmed in self._confirmed.items():
             confirmed[(confirmed < 0) & self._tallies["global", name].assigned(k)] = k
@@ -309,17 +311,17 @@ class _Score:
     def evaluations(self) -> dict[str, Evaluation]:
         """By centre; without one, by an empty name."""
         scores = {key: tally.scores() for key, tally in self._tallies.items()}
-        sources = {name: scores["local", name] for name in self._ground.sources}
+        sources = {name: scores["local", name] for name in self._reference.sources}
         seen, times = self._seen.astype(np.int64), self._truth.times
         found: dict[str, Evaluation] = {}
-        for name in self._ground.centres or [""]:
+        for name in self._reference.centres or [""]:
             confirmed = self._confirmed.get(name, np.full(len(self._begins), -1))
             after = np.maximum(times[confirmed] - times[self._begins], 0) / 1e9
             fused = scores["global", name] if name else self._alone.scores() if self._alone else None
             assert fused is not None
             found[name] = Evaluation(
-                c=self._ground.c,
-                dimension=len(self._ground.axes),
+                c=self._reference.c,
+                dimension=len(self._reference.axes),
                 times=times,
                 targets=self._truth.targets,
                 exists=self._exists,
@@ -327,8 +329,8 @@ class _Score:
                 sources=sources,
                 fused=fused,
                 seen=seen,
-                shared=shared_pairs(list(sources.values()), fused, seen, len(self._ground.axes)),
-                left_out=self._ground.left_out,
+                shared=fusion_gain(list(sources.values()), fused, seen, len(self._reference.axes)),
+                left_out=self._reference.left_out,
                 begins=self._begins,
                 confirm=np.where((confirmed >= 0) & (self._begins >= 0), after, np.nan),
             )
@@ -342,13 +344,13 @@ def _nothing(m: int, d: int) -> Block:
 class _Thin:
     """Keeps every so many messages of each source and of the first centre, about `rows` tracks of each."""
 
-    def __init__(self, book: Logbook, ground: Ground, rows: int) -> None:
+    def __init__(self, book: Logbook, reference: Reference, rows: int) -> None:
         self.sample: list[Message] = list(book.infos.values()) if rows else []
-        wanted = [("local", name) for name in ground.sources] + [("global", name) for name in ground.centres[:1]]
+        wanted = [("local", name) for name in reference.sources] + [("global", name) for name in reference.centres[:1]]
         self._every = {key: max(1, -(-book.traffic[key].tracks // rows)) for key in wanted} if rows else {}
         self._count = dict.fromkeys(wanted, 0)
 
-    def add(self, key: tuple[str, str], message: Tracks) -> None:
+    def add(self, key: tuple[str, str], message: TrackMessage) -> None:
         if key in self._every:
             if self._count[key] % self._every[key] == 0:
                 self.sample.append(message)

@@ -23,12 +23,10 @@ from fusion_service.metrics import nees, nees_bounds
 from fusion_service.review.snapshots import Block, Numbers
 from schemas import GlobalTracks
 
-__all__ = ["Agreement", "Consistency", "Pair"]
-
-Floats = NDArray[np.float64]
+__all__ = ["Consistency", "SourceAgreement", "SourcePair"]
 
 
-class Pair(NamedTuple):
+class SourcePair(NamedTuple):
     """Two sources: n pairs of tracks, the mean of d2 over its dimension, and where it lies with 95 % if errors are
     independent, also in time, and as said; NaN without a pair."""
 
@@ -38,11 +36,11 @@ class Pair(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Agreement:
+class SourceAgreement:
     """By pair of sources, in alphabetical order."""
 
     dimension: int
-    pairs: dict[tuple[str, str], Pair]
+    pairs: dict[tuple[str, str], SourcePair]
 
 
 class Consistency:
@@ -100,13 +98,13 @@ class Consistency:
             self._of = picture, links
         return self._of[1]
 
-    def result(self) -> Agreement:
+    def result(self) -> SourceAgreement:
         """When all blocks are added."""
         nothing = (np.nan, np.nan)
-        return Agreement(
+        return SourceAgreement(
             self._dimension,
             {
-                pair: Pair(n, total / n if n else np.nan, nees_bounds(self._dimension, n) if n else nothing)
+                pair: SourcePair(n, total / n if n else np.nan, nees_bounds(self._dimension, n) if n else nothing)
                 for pair, (n, total) in self._sums.items()
             },
         )

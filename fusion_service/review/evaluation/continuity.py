@@ -25,15 +25,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.linalg import FloatArray
 from fusion_service.metrics import assign_near
+from fusion_service.review.snapshots import Indices
 
-__all__ = ["Following", "Moment", "Siap", "ospa2", "siap_of"]
-
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
+__all__ = ["Following", "Instant", "Siap", "ospa2", "siap_of"]
 
 
-class Moment(NamedTuple):
+class Instant(NamedTuple):
     """One time: the J true objects there, the N tracks there, and the pairs (K,) of both that are closer than the
     cut-off, as numbers that mean the same at all times, with their distances (K,)."""
 
@@ -41,7 +40,7 @@ class Moment(NamedTuple):
     tracks: Indices
     i: Indices
     j: Indices
-    d: Floats
+    d: FloatArray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -96,7 +95,7 @@ class Following:
 def siap_of(
     segments: NDArray[np.int64],
     times: NDArray[np.int64],
-    lives: Floats,
+    lives: FloatArray,
     counts: tuple[float, float, float, float],
     accuracy: tuple[float, float],
 ) -> Siap:
@@ -142,16 +141,16 @@ def _ratio(part: float, whole: float) -> float:
     return part / whole if whole > 0 else float("nan")
 
 
-def ospa2(window: deque[Moment], c: float, p: float = 2.0) -> float:
-    """OSPA(2) over the moments of a window."""
-    objects, at_object, there = _presence([moment.objects for moment in window])
-    tracks, at_track, shown = _presence([moment.tracks for moment in window])
+def ospa2(window: deque[Instant], c: float, p: float = 2.0) -> float:
+    """OSPA(2) over the instants of a window."""
+    objects, at_object, there = _presence([instant.objects for instant in window])
+    tracks, at_track, shown = _presence([instant.tracks for instant in window])
     most = max(len(objects), len(tracks))
     if not most:
         return 0.0
-    i = np.searchsorted(objects, np.concatenate([moment.i for moment in window]))
-    j = np.searchsorted(tracks, np.concatenate([moment.j for moment in window]))
-    d = np.concatenate([moment.d for moment in window])
+    i = np.searchsorted(objects, np.concatenate([instant.i for instant in window]))
+    j = np.searchsorted(tracks, np.concatenate([instant.j for instant in window]))
+    d = np.concatenate([instant.d for instant in window])
     pairs, at = np.unique(i * max(len(tracks), 1) + j, return_inverse=True)
     i, j = np.divmod(pairs, max(len(tracks), 1))
     close, apart = np.bincount(at, minlength=len(pairs)), np.bincount(at, weights=d, minlength=len(pairs))

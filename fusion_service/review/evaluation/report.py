@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import tempfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from itertools import combinations
 from pathlib import Path
@@ -12,13 +12,15 @@ from pathlib import Path
 import numpy as np
 
 from fusion_service.errors import ReviewError
-from fusion_service.review.evaluation.assess import Assessment
+from fusion_service.recording.drawing.labels import utc
+from fusion_service.review.evaluation.assess import Assessment, Evaluation
 from fusion_service.review.evaluation.report_text import CSS, WORDS
-from fusion_service.review.evaluation.results import facts, label, rows_of, rule_of, utc
+from fusion_service.review.evaluation.results import facts, label, rows_of, rule_of
+from fusion_service.review.evaluation.scoring import Scores
 from fusion_service.review.evaluation.tables import (
     DELAYS,
     NUMBERS,
-    Row,
+    ScoredCentre,
     best_rows,
     comparison,
     confirm_line,
@@ -27,6 +29,7 @@ from fusion_service.review.evaluation.tables import (
     links,
     pair_words,
     percent,
+    power_of_ten,
     row_name,
     rules_table,
     sentence,
@@ -35,7 +38,17 @@ from fusion_service.review.evaluation.tables import (
 
 __all__ = ["need_matplotlib", "report"]
 
-RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+SCORES = (
+    "",
+    "RMSE, m",
+    "GOSPA, m",
+    "localisation, m²",
+    "missed, m²",
+    "false, m²",
+    "ANEES",
+    "95 % bounds",
+    "switches",
+)
 SHARED = ("", "pairs", "RMSE fused", "best single", "ANEES fused", "best single", "95 % bounds", "no fused track")
 
 
@@ -88,7 +101,7 @@ def _short(value: float) -> str:
     if not value >= 1e5:
         return digits(value)
     mantissa, power = f"{value:.2e}".split("e+")
-    return f"{mantissa}·10{str(int(power)).translate(RAISED)}"
+    return f"{mantissa}·{power_of_ten(int(power))}"
 
 
 def _facts(one: Assessment) -> str:
@@ -118,7 +131,7 @@ def _left(k: int, left: int) -> str:
     return ' class="left"' if 0 < k < left else ""
 
 
-def _rules(rows: Sequence[Row]) -> str:
+def _rules(rows: Sequence[ScoredCentre]) -> str:
     head, *lines = rules_table(rows)
     best = best_rows(rows)
     marks = {(index, k): "best" for k, name in enumerate(head) for index in best.get(name, ())}
@@ -135,16 +148,16 @@ def _map(one: Assessment) -> list[str]:
             path = mission_map(one.sample, Path(folder) / "map.png")
         except ValueError:
             return []
-        picture = base64.b64encode(path.read_bytes()).decode()
+        encoded = base64.b64encode(path.read_bytes()).decode()
     text = "Truth, what each source tracked, and the fused tracks. Details show two targets at their true scale."
     return [
         "<h2>Map</h2>",
-        f'<figure class="map"><div class="scroll"><img alt="Map of the mission" src="data:image/png;base64,{picture}">'
+        f'<figure class="map"><div class="scroll"><img alt="Map of the mission" src="data:image/png;base64,{encoded}">'
         f"</div><figcaption>{text}</figcaption></figure>",
     ]
 
 
-def _against_truth(rows: Sequence[Row]) -> list[str]:
+def _against_truth(rows: Sequence[ScoredCentre]) -> list[str]:
     """Of the rows of one recording."""
     evaluation = rows[0].evaluation
     fused = {
@@ -153,6 +166,28 @@ def _against_truth(rows: Sequence[Row]) -> list[str]:
         if row.evaluation.centre
     }
     scored = {**evaluation.sources, **{name: one.fused for name, one in fused.items()}}
+    about = (
+        f"Scored at {len(evaluation.times)} times against {len(evaluation.targets)} targets, "
+        f"{utc(int(evaluation.times[0]))} to {utc(int(evaluation.times[-1]))}; GOSPA with p = 2, alpha = 2, "
+        f"c = {evaluation.c:g} m."
+    )
+    found = [f'<p class="note">{escape(about)}</p>', _scores(scored)]
+    found += [f"<p>Not scored: {escape(name)}: {escape(why)}</p>" for name, why in evaluation.left_out.items()]
+    if evaluation.seen.max(initial=0) > 1 and fused:
+        text = "On the same pairs of target and time. The best single source is found with the truth, for each target."
+        found += ["<h3>What fusion gains: targets that several sources track</h3>", _gain(fused)]
+        found.append(f'<p class="note">{text}</p>')
+    names, *following = tracking_table(scored, len(evaluation.targets))
+    found += ["<h3>How well tracks hold on to targets</h3>", _table(names, following)]
+    told: dict[str, list[str]] = {}
+    for name, one in fused.items():
+        told.setdefault(confirm_line(one), []).append(name)
+    found += [f"<p>{escape(line + ('' if len(told) == 1 else ' ' + ', '.join(of)))}</p>" for line, of in told.items()]
+    return found
+
+
+def _scores(scored: Mapping[str, Scores]) -> str:
+    """A line for each source, and for the fused tracks of each row."""
     lines = [
         [
             name,
@@ -164,51 +199,29 @@ def _against_truth(rows: Sequence[Row]) -> list[str]:
         ]
         for name, one in scored.items()
     ]
-    marks = {(index, 6): _mark(one.anees, one.bounds) for index, one in enumerate(scored.values())}
-    head = (
-        "",
-        "RMSE, m",
-        "GOSPA, m",
-        "localisation, m²",
-        "missed, m²",
-        "false, m²",
-        "ANEES",
-        "95 % bounds",
-        "switches",
+    return _table(
+        SCORES, lines, {(index, 6): _mark(one.anees, one.bounds) for index, one in enumerate(scored.values())}
     )
-    about = (
-        f"Scored at {len(evaluation.times)} times against {len(evaluation.targets)} targets, "
-        f"{utc(int(evaluation.times[0]))} to {utc(int(evaluation.times[-1]))}; GOSPA with p = 2, alpha = 2, "
-        f"c = {evaluation.c:g} m."
-    )
-    found = [f'<p class="note">{escape(about)}</p>', _table(head, lines, marks)]
-    found += [f"<p>Not scored: {escape(name)}: {escape(why)}</p>" for name, why in evaluation.left_out.items()]
-    if evaluation.seen.max(initial=0) > 1 and fused:
-        shared = [
-            [
-                name if len(rows) > 1 else kind.replace("_", " "),
-                str(line["pairs"]),
-                digits(line["fused_rmse"]),
-                digits(line["best_rmse"]),
-                fixed(line["fused_anees"]),
-                fixed(line["best_anees"]),
-                fixed(*line["nees_bounds"]),
-                str(line["fused_missed"]),
-            ]
-            for name, one in fused.items()
-            for kind, line in one.shared.items()
-            if len(rows) == 1 or kind == "seen_by_2_or_more"
+
+
+def _gain(fused: Mapping[str, Evaluation]) -> str:
+    """Fused tracks beside the best single source: of one row by how many saw a target, of several of two or more."""
+    lines = [
+        [
+            name if len(fused) > 1 else kind.replace("_", " "),
+            str(line["pairs"]),
+            digits(line["fused_rmse"]),
+            digits(line["best_rmse"]),
+            fixed(line["fused_anees"]),
+            fixed(line["best_anees"]),
+            fixed(*line["nees_bounds"]),
+            str(line["fused_missed"]),
         ]
-        found += ["<h3>What fusion gains: targets that several sources track</h3>", _table(SHARED, shared)]
-        text = "On the same pairs of target and time. The best single source is found with the truth, for each target."
-        found.append(f'<p class="note">{text}</p>')
-    names, *following = tracking_table(scored, len(evaluation.targets))
-    found += ["<h3>How well tracks hold on to targets</h3>", _table(names, following)]
-    told: dict[str, list[str]] = {}
-    for name, one in fused.items():
-        told.setdefault(confirm_line(one), []).append(name)
-    found += [f"<p>{escape(line + ('' if len(told) == 1 else ' ' + ', '.join(of)))}</p>" for line, of in told.items()]
-    return found
+        for name, one in fused.items()
+        for kind, line in one.shared.items()
+        if len(fused) == 1 or kind == "seen_by_2_or_more"
+    ]
+    return _table(SHARED, lines)
 
 
 def _mark(value: float, bounds: tuple[float, float]) -> str:

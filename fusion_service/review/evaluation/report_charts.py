@@ -12,25 +12,36 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.colours import FUSED, SOURCES, source_colours
-from fusion_service.review.evaluation.logbook import BINS
+from fusion_service.colours import (
+    BLUE,
+    GREEN,
+    ORANGE,
+    PAPER_FUSED,
+    PAPER_TRUTH,
+    SKY,
+    SOURCES,
+    VERMILION,
+    source_colours,
+)
+from fusion_service.linalg import FloatArray
+from fusion_service.review.evaluation.latency import BINS
 from fusion_service.review.evaluation.scoring import WINDOW, Scores
-from fusion_service.review.evaluation.tables import Row, row_name
+from fusion_service.review.evaluation.tables import ScoredCentre, power_of_ten, row_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from fusion_service.review.evaluation.logbook import Latency
+    from fusion_service.review.evaluation.latency import Latency
 
 __all__ = ["charts", "delay_chart"]
 
-Floats = NDArray[np.float64]
 
 POINTS = 500
 """Points of a line, at most: means over equal parts of the mission where there are more times."""
 SIZE = (5.0, 3.0)
-RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
-PARTS = {"localisation": "#56b4e9", "missed": "#e69f00", "false": "#d55e00"}
+PARTS = {"localisation": SKY, "missed": ORANGE, "false": VERMILION}
+Line = tuple[str, str, float, Scores, FloatArray]
+"""Name, colour, width, scores, and seconds (K,) since the first scored time."""
 STYLE: Any = {
     "svg.fonttype": "none",
     "text.parse_math": False,
@@ -51,67 +62,70 @@ STYLE: Any = {
 }
 
 
-def charts(rows: Sequence[Row]) -> list[tuple[str, str]]:
+def charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
     """(SVG, what it shows and how to read it) of scored rows, which must not be none: of one row with its sources, of
     several beside each other. Without a centre: of its sources alone."""
-    first = rows[0]
     lines = _lines(rows)
     if not lines:
         return []
-    fused = first.evaluation.centre is not None
-    beside = "the fused tracks of each row" if len(rows) > 1 else "each source and the fused tracks"
-    found = []
-
-    def put(draw: Callable[[Axes], None], title: str, text: str) -> None:
-        found.append((_chart(draw, title), text))
-
+    fused = rows[0].evaluation.centre is not None
+    found = [_parts_chart(rows)] if fused else []
+    found += _error_charts(rows, lines)
     if fused:
-        put(
-            lambda axes: _parts(axes, first),
-            f"GOSPA², its parts{_of(rows)}",
-            "Its parts: errors of position, targets missed, false tracks. The tallest layer is what to mend.",
+        found += _number_charts(rows)
+    found.append(
+        (
+            _chart(lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"), "OSPA(2): tracks, not points"),
+            f"Compares whole tracks over {WINDOW} scored times: a track that changes its target or breaks costs too. "
+            "Lower is better.",
         )
-    put(
-        lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"),
-        "GOSPA over time",
-        f"All faults in one number for {beside}. Lower is better.",
-    )
-    put(
-        lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"),
-        "Error of position over time",
-        "Only of targets that are followed at that time: a source that follows only easy ones looks good here.",
-    )
-    put(
-        lambda axes: _nees(axes, lines),
-        "Consistency: ANEES over time",
-        "1 is ideal. Above the band the covariances are too small (overconfident), below it too large (cautious).",
-    )
-    if fused:
-        put(
-            lambda axes: _cardinality(axes, rows),
-            "How many there are",
-            "Targets that exist, and fused tracks that are shown. Shown below true: missed; above: false or double. "
-            "Expected: the sum of existence probabilities, tentative tracks included.",
-        )
-        put(
-            lambda axes: _siap(axes, first),
-            f"SIAP of the fused tracks{_of(rows)}",
-            "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per "
-            "target that has one: 1 is ideal.",
-        )
-    put(
-        lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"),
-        "OSPA(2): tracks, not points",
-        f"Compares whole tracks over {WINDOW} scored times: a track that changes its target or breaks costs too. "
-        "Lower is better.",
     )
     if any(np.isfinite(row.evaluation.confirm).any() for row in rows):
-        put(
-            lambda axes: _confirm(axes, rows),
-            "Time to confirm",
-            "Share of the targets that a source covered or tracked which had a fused track after so many seconds.",
-        )
+        text = "Share of the targets that a source covered or tracked which had a fused track after so many seconds."
+        found.append((_chart(lambda axes: _confirm(axes, rows), "Time to confirm"), text))
     return found
+
+
+def _parts_chart(rows: Sequence[ScoredCentre]) -> tuple[str, str]:
+    return (
+        _chart(lambda axes: _parts(axes, rows[0]), f"GOSPA², its parts{_of(rows)}"),
+        "Its parts: errors of position, targets missed, false tracks. The tallest layer is what to mend.",
+    )
+
+
+def _error_charts(rows: Sequence[ScoredCentre], lines: Sequence[Line]) -> list[tuple[str, str]]:
+    """GOSPA, RMSE and ANEES over time."""
+    beside = "the fused tracks of each row" if len(rows) > 1 else "each source and the fused tracks"
+    return [
+        (
+            _chart(lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"), "GOSPA over time"),
+            f"All faults in one number for {beside}. Lower is better.",
+        ),
+        (
+            _chart(lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"), "Error of position over time"),
+            "Only of targets that are followed at that time: a source that follows only easy ones looks good here.",
+        ),
+        (
+            _chart(lambda axes: _nees(axes, lines), "Consistency: ANEES over time"),
+            "1 is ideal. Above the band the covariances are too small (overconfident), below it too large (cautious).",
+        ),
+    ]
+
+
+def _number_charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
+    """How many fused tracks there are, and how many of them are right."""
+    return [
+        (
+            _chart(lambda axes: _cardinality(axes, rows), "How many there are"),
+            "Targets that exist, and fused tracks that are shown. Shown below true: missed; above: false or double. "
+            "Expected: the sum of existence probabilities, tentative tracks included.",
+        ),
+        (
+            _chart(lambda axes: _siap(axes, rows[0]), f"SIAP of the fused tracks{_of(rows)}"),
+            "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per "
+            "target that has one: 1 is ideal.",
+        ),
+    ]
 
 
 def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str) -> str:
@@ -123,19 +137,19 @@ def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str)
             wide = 8 if delay.n < 64 else wide
             share = np.array(delay.counts).reshape(-1, wide).sum(axis=1) / delay.n
             edges = 1000 * np.array(delay.edges)[::wide]
-            axes.stairs(100 * share, edges, color=colours.get(name, FUSED), label=name, lw=1.4)
+            axes.stairs(100 * share, edges, color=colours.get(name, PAPER_FUSED), label=name, lw=1.4)
         axes.set(xlabel="delay, ms", ylabel="messages, %", ylim=(0, None))
         _legend(axes)
 
     return _chart(draw, title)
 
 
-def _of(rows: Sequence[Row]) -> str:
+def _of(rows: Sequence[ScoredCentre]) -> str:
     return f" ({rows[0].rule})" if len(rows) > 1 else ""
 
 
-def _lines(rows: Sequence[Row]) -> list[tuple[str, str, float, Scores, Floats]]:
-    """(name, colour, width, scores, seconds) of the lines of a chart."""
+def _lines(rows: Sequence[ScoredCentre]) -> list[Line]:
+    """Of a chart over time: of one row its sources and fused tracks, else the fused tracks of each."""
     first = rows[0].evaluation
     if len(rows) == 1:
         colours = source_colours(first.sources)
@@ -143,20 +157,20 @@ def _lines(rows: Sequence[Row]) -> list[tuple[str, str, float, Scores, Floats]]:
         lines = [(name, colours[name], 1.2, scores, seconds) for name, scores in first.sources.items()]
         if first.centre is None:
             return lines
-        return [*lines, (f"fused, {rows[0].rule}", FUSED, 2.0, first.fused, seconds)]
-    palette = (FUSED, *SOURCES)
+        return [*lines, (f"fused, {rows[0].rule}", PAPER_FUSED, 2.0, first.fused, seconds)]
+    tones = (PAPER_FUSED, *SOURCES)
     return [
-        (row_name(row, rows), palette[k % len(palette)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
+        (row_name(row, rows), tones[k % len(tones)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
         for k, row in enumerate(rows)
     ]
 
 
-def _seconds(times: NDArray[np.int64]) -> Floats:
-    seconds: Floats = (times - times[0]) / 1e9
+def _seconds(times: NDArray[np.int64]) -> FloatArray:
+    seconds: FloatArray = (times - times[0]) / 1e9
     return seconds
 
 
-def _thin(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
+def _thin(seconds: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Means over parts of the mission, so that a line has `POINTS` at most."""
     if len(seconds) <= POINTS:
         return seconds, values
@@ -167,17 +181,17 @@ def _thin(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
     return np.bincount(part, seconds, POINTS) / np.bincount(part, minlength=POINTS), mean
 
 
-def _parts(axes: Axes, row: Row) -> None:
+def _parts(axes: Axes, row: ScoredCentre) -> None:
     series, seconds = row.evaluation.fused.series, _seconds(row.evaluation.times)
     power = 3 * int(np.floor(np.log10(max(float((series.gospa**2).max()), 1.0)) / 3))
     layers = [_thin(seconds, getattr(series, name))[1] / 10**power for name in PARTS]
     axes.stackplot(_thin(seconds, series.gospa)[0], *layers, labels=list(PARTS), colors=list(PARTS.values()), lw=0)
-    unit = f"10{str(power).translate(RAISED)} m²" if power else "m²"
+    unit = f"{power_of_ten(power)} m²" if power else "m²"
     axes.set(xlabel="s since the first scored time", ylabel=unit, ylim=(0, None))
     _legend(axes)
 
 
-def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]], what: str, unit: str) -> None:
+def _over_time(axes: Axes, lines: Sequence[Line], what: str, unit: str) -> None:
     for name, colour, width, scores, seconds in lines:
         values = getattr(scores.series, what)
         if what == "ospa2":
@@ -187,11 +201,11 @@ def _over_time(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats
     _legend(axes)
 
 
-def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]]) -> None:
+def _nees(axes: Axes, lines: Sequence[Line]) -> None:
     _, _, _, fused, seconds = lines[-1] if lines[-1][0].startswith("fused") else lines[0]
     x, low = _thin(seconds, fused.series.low)
-    axes.fill_between(x, low, _thin(seconds, fused.series.high)[1], color="#009e73", alpha=0.18, lw=0, label="95 %")
-    axes.axhline(1.0, color="#009e73", lw=0.8)
+    axes.fill_between(x, low, _thin(seconds, fused.series.high)[1], color=GREEN, alpha=0.18, lw=0, label="95 %")
+    axes.axhline(1.0, color=GREEN, lw=0.8)
     for name, colour, width, scores, at in lines:
         axes.plot(*_thin(at, scores.series.anees), color=colour, lw=width, label=name)
     values = np.concatenate([scores.series.anees[np.isfinite(scores.series.anees)] for *_, scores, _ in lines])
@@ -200,14 +214,14 @@ def _nees(axes: Axes, lines: Sequence[tuple[str, str, float, Scores, Floats]]) -
     _legend(axes)
 
 
-def _cardinality(axes: Axes, rows: Sequence[Row]) -> None:
+def _cardinality(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
     first = rows[0].evaluation
     seconds = _seconds(first.times)
-    axes.plot(*_thin(seconds, first.exists.sum(axis=1).astype(float)), color="#999999", lw=4, alpha=0.6, label="true")
+    axes.plot(*_thin(seconds, first.exists.sum(axis=1).astype(float)), color=PAPER_TRUTH, lw=4, alpha=0.6, label="true")
     if len(rows) == 1:
-        axes.plot(*_thin(seconds, first.fused.series.shown.astype(float)), color=FUSED, label="shown")
+        axes.plot(*_thin(seconds, first.fused.series.shown.astype(float)), color=PAPER_FUSED, label="shown")
         if np.isfinite(first.fused.series.expected).any():
-            axes.plot(*_thin(seconds, first.fused.series.expected), "--", color="#0072b2", lw=1.2, label="expected")
+            axes.plot(*_thin(seconds, first.fused.series.expected), "--", color=BLUE, lw=1.2, label="expected")
     else:
         for name, colour, width, scores, at in _lines(rows):
             axes.plot(*_thin(at, scores.series.shown.astype(float)), color=colour, lw=width, label=name)
@@ -215,20 +229,20 @@ def _cardinality(axes: Axes, rows: Sequence[Row]) -> None:
     _legend(axes)
 
 
-def _siap(axes: Axes, row: Row) -> None:
+def _siap(axes: Axes, row: ScoredCentre) -> None:
     series, seconds = row.evaluation.fused.series, _seconds(row.evaluation.times)
     for name, label, colour in (
-        ("completeness", "complete", "#009e73"),
-        ("spuriousness", "spurious", "#d55e00"),
-        ("ambiguity", "tracks per target", "#0072b2"),
+        ("completeness", "complete", GREEN),
+        ("spuriousness", "spurious", VERMILION),
+        ("ambiguity", "tracks per target", BLUE),
     ):
         axes.plot(*_thin(seconds, getattr(series, name)), color=colour, label=label)
     axes.set(xlabel="s since the first scored time", ylabel="share, number", ylim=(-0.03, None))
     _legend(axes)
 
 
-def _confirm(axes: Axes, rows: Sequence[Row]) -> None:
-    palette = (FUSED, *SOURCES)
+def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
+    tones = (PAPER_FUSED, *SOURCES)
     for k, row in enumerate(rows):
         known = int((row.evaluation.begins >= 0).sum())
         after = np.sort(row.evaluation.confirm[np.isfinite(row.evaluation.confirm)])
@@ -236,7 +250,7 @@ def _confirm(axes: Axes, rows: Sequence[Row]) -> None:
             continue
         x, y = np.append(after, after[-1] * 1.08 + 1), np.append(np.arange(1, len(after) + 1), len(after))
         label = row_name(row, rows) if len(rows) > 1 else None
-        axes.step([0, *x], [0, *(100 * y / known)], where="post", color=palette[k % len(palette)], label=label)
+        axes.step([0, *x], [0, *(100 * y / known)], where="post", color=tones[k % len(tones)], label=label)
     axes.set(xlabel="s since it could be known", ylabel="targets confirmed, %", ylim=(0, 104), xlim=(0, None))
     if len(rows) > 1:
         _legend(axes)

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.evaluation.assess import Assessment
 from fusion_service.review.evaluation.scoring import plain
 from fusion_service.review.evaluation.tables import (
     NUMBERS,
-    Row,
+    ScoredCentre,
     aligned,
     comparison,
     confirm_line,
@@ -22,7 +22,7 @@ from fusion_service.review.evaluation.tables import (
     truthless_lines,
 )
 
-__all__ = ["facts", "label", "results", "rows_of", "rule_of", "text", "utc"]
+__all__ = ["facts", "label", "results", "rows_of", "rule_of", "text"]
 
 
 def rule_of(assessment: Assessment, centre: str) -> str:
@@ -32,23 +32,19 @@ def rule_of(assessment: Assessment, centre: str) -> str:
     return named[0][0] if named else "no centre"
 
 
-def rows_of(assessments: Sequence[Assessment]) -> list[Row]:
+def rows_of(assessments: Sequence[Assessment]) -> list[ScoredCentre]:
     """A row for each centre that could be scored."""
     return [
-        Row(label(one), centre, rule_of(one, centre), evaluation)
+        ScoredCentre(label(one), centre, rule_of(one, centre), evaluation)
         for one in assessments
         for centre, evaluation in one.evaluations.items()
     ]
 
 
 def label(assessment: Assessment) -> str:
+    """The recording by its name, that of its folder if its own says nothing; empty for a mission in memory."""
     path = assessment.book.path
     return (path.parent.name if path.stem == "mission" and path.parent.name else path.stem) if path else ""
-
-
-def utc(time: int) -> str:
-    """ISO 8601 to the second."""
-    return datetime.fromtimestamp(time // 10**9, UTC).strftime("%Y-%m-%d %H:%M:%SZ")
 
 
 def facts(assessment: Assessment) -> dict[str, str]:

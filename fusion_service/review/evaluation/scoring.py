@@ -15,15 +15,13 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
+from fusion_service.linalg import FloatArray
 from fusion_service.metrics import DENSE, assign_near, near_pairs, nees, nees_bounds
-from fusion_service.review.evaluation.continuity import Following, Moment, Siap, ospa2, siap_of
-from fusion_service.review.snapshots import Block
+from fusion_service.review.evaluation.continuity import Following, Instant, Siap, ospa2, siap_of
+from fusion_service.review.snapshots import Block, Times
 
-__all__ = ["METRICS", "WINDOW", "P", "Scores", "Series", "Tally", "averages", "bounds", "plain"]
+__all__ = ["METRICS", "WINDOW", "Scores", "Series", "Tally", "averages", "bounds", "plain"]
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
-Ints = NDArray[np.int64]
 
 METRICS = (
     "gospa",
@@ -49,23 +47,23 @@ class Series:
     probabilities expect (NaN where it says none); SIAP's completeness, ambiguity, spuriousness.
     ospa2: at the times with the indices `windows`."""
 
-    gospa: Floats
-    localisation: Floats
-    missed: Floats
-    false: Floats
-    ospa: Floats
-    rmse: Floats
-    anees: Floats
-    low: Floats
-    high: Floats
-    pairs: Ints
-    shown: Ints
-    expected: Floats
-    completeness: Floats
-    ambiguity: Floats
-    spuriousness: Floats
-    windows: Ints
-    ospa2: Floats
+    gospa: FloatArray
+    localisation: FloatArray
+    missed: FloatArray
+    false: FloatArray
+    ospa: FloatArray
+    rmse: FloatArray
+    anees: FloatArray
+    low: FloatArray
+    high: FloatArray
+    pairs: NDArray[np.int64]
+    shown: NDArray[np.int64]
+    expected: FloatArray
+    completeness: FloatArray
+    ambiguity: FloatArray
+    spuriousness: FloatArray
+    windows: NDArray[np.int64]
+    ospa2: FloatArray
 
     def as_json(self) -> dict[str, list[Any]]:
         """Rounded to six digits, None for what does not exist."""
@@ -91,8 +89,8 @@ class Scores:
     anees: float
     identity_switches: int
     bounds: tuple[float, float]
-    errors: Floats
-    nees: Floats
+    errors: FloatArray
+    nees: FloatArray
     rmse_velocity: float
     ospa: float
     ospa2: float
@@ -121,7 +119,7 @@ class Tally:
     times (K,); truth (K, T, m): position, and then velocity, NaN where it is not known or a target does not exist.
     """
 
-    def __init__(self, times: Times, truth: Floats, d: int, c: float) -> None:
+    def __init__(self, times: Times, truth: FloatArray, d: int, c: float) -> None:
         count, targets = truth.shape[:2]
         self._times, self._truth, self._d, self._c = times, truth, d, c
         self._parts = np.zeros((count, 3))
@@ -139,7 +137,7 @@ class Tally:
         self._tracks = np.zeros(0, dtype=np.bool_)
         """By the number of a track: whether it was ever shown."""
         self._following = Following(targets)
-        self._window: deque[Moment] = deque(maxlen=WINDOW)
+        self._window: deque[Instant] = deque(maxlen=WINDOW)
         self._stride = max(1, count // WINDOWS)
         self._windows: list[tuple[int, float]] = []
 
@@ -166,7 +164,7 @@ class Tally:
         self._following.add(k, there[rows], number[columns])
         from_end = len(self._times) - 1 - k
         if from_end % self._stride < WINDOW:
-            self._window.append(Moment(there, number, there[i], number[j], apart))
+            self._window.append(Instant(there, number, there[i], number[j], apart))
             if from_end % self._stride == 0:
                 self._windows.append((k, ospa2(self._window, c, P)))
         if from_end % self._stride == 0 and self._stride >= WINDOW:
@@ -183,7 +181,7 @@ class Tally:
         targets: NDArray[np.intp],
         rows: NDArray[np.intp],
         tracks: NDArray[np.intp],
-        apart: Floats,
+        apart: FloatArray,
         objects: int,
         shown: int,
         block: Block,
@@ -210,74 +208,82 @@ class Tally:
 
     def scores(self) -> Scores:
         """When all times are added."""
-        errors, squared, d = self._errors, self._nees, self._d
-        pairs = np.isfinite(errors)
-        exists = np.isfinite(self._truth[:, :, 0])
+        errors, squared = self._errors, self._nees
+        pairs, exists = np.isfinite(errors), np.isfinite(self._truth[:, :, 0])
+        series = self._series(pairs, exists)
         localisation, missed, false = self._parts.T
-        gospa = self._parts.sum(axis=1) ** (1 / P)
         rmse, anees = averages(errors[pairs], squared[pairs])
-        counts = pairs.sum(axis=1)
-        objects, tracked, assigned = exists.sum(axis=1), self._siap[:, 0], self._siap[:, 1]
         with np.errstate(invalid="ignore", divide="ignore"):
-            over_time = np.sqrt(np.nansum(errors**2, axis=1) / counts)
-            consistent = np.nansum(squared, axis=1) / counts
-            accuracy = self._sums[[0, 2]] / self._sums[[1, 3]]
             velocity = np.sqrt(self._velocity[0] / self._velocity[1])
-            low, high = (2 * gammaincinv(d * counts / 2, q) / (d * counts) for q in (0.025, 0.975))
-            share = [tracked / objects, assigned / tracked, 1 - assigned / self._shown]
-        life = np.zeros(0)
-        if len(exists):
-            some = exists[:, exists.any(axis=0)]
-            life = (self._times[len(some) - 1 - some[::-1].argmax(axis=0)] - self._times[some.argmax(axis=0)]) / 1e9
-        sums = (float(objects.sum()), float(tracked.sum()), float(self._shown.sum()), float(assigned.sum()))
-        windows = np.array([k for k, _ in self._windows], dtype=np.int64)
-        tracks2 = np.array([value for _, value in self._windows])
         return Scores(
-            gospa=float(gospa.mean()),
+            gospa=float(series.gospa.mean()),
             gospa_localisation=float(localisation.mean()),
             gospa_missed=float(missed.mean()),
             gospa_false=float(false.mean()),
             rmse_position=rmse,
             anees=anees,
             identity_switches=self._switches,
-            bounds=bounds(d, int(pairs.sum())),
+            bounds=bounds(self._d, int(pairs.sum())),
             errors=errors,
             nees=squared,
             rmse_velocity=float(velocity),
             ospa=float(self._ospa.mean()),
-            ospa2=float(tracks2.mean()),
+            ospa2=float(series.ospa2.mean()),
             followed=int((pairs.sum(axis=0) >= np.maximum(HALF * exists.sum(axis=0), 1)).sum()),
             tracks=int(self._tracks.sum()),
-            siap=siap_of(
-                self._following.segments(len(self._times) - 1),
-                self._times,
-                life,
-                sums,
-                (float(accuracy[0]), float(accuracy[1])),
-            ),
-            series=Series(
-                gospa=gospa,
-                localisation=localisation,
-                missed=missed,
-                false=false,
-                ospa=self._ospa,
-                rmse=over_time,
-                anees=consistent,
-                low=low,
-                high=high,
-                pairs=counts,
-                shown=self._shown,
-                expected=self._expected,
-                completeness=share[0],
-                ambiguity=share[1],
-                spuriousness=share[2],
-                windows=windows,
-                ospa2=tracks2,
-            ),
+            siap=self._siap_of(exists),
+            series=series,
+        )
+
+    def _series(self, pairs: NDArray[np.bool_], exists: NDArray[np.bool_]) -> Series:
+        """pairs (K, T): where a track is assigned; exists (K, T): where a target is."""
+        counts, d = pairs.sum(axis=1), self._d
+        objects, tracked, assigned = exists.sum(axis=1), self._siap[:, 0], self._siap[:, 1]
+        localisation, missed, false = self._parts.T
+        with np.errstate(invalid="ignore", divide="ignore"):
+            over_time = np.sqrt(np.nansum(self._errors**2, axis=1) / counts)
+            consistent = np.nansum(self._nees, axis=1) / counts
+            low, high = (2 * gammaincinv(d * counts / 2, q) / (d * counts) for q in (0.025, 0.975))
+            share = [tracked / objects, assigned / tracked, 1 - assigned / self._shown]
+        return Series(
+            gospa=self._parts.sum(axis=1) ** (1 / P),
+            localisation=localisation,
+            missed=missed,
+            false=false,
+            ospa=self._ospa,
+            rmse=over_time,
+            anees=consistent,
+            low=low,
+            high=high,
+            pairs=counts,
+            shown=self._shown,
+            expected=self._expected,
+            completeness=share[0],
+            ambiguity=share[1],
+            spuriousness=share[2],
+            windows=np.array([k for k, _ in self._windows], dtype=np.int64),
+            ospa2=np.array([value for _, value in self._windows]),
+        )
+
+    def _siap_of(self, exists: NDArray[np.bool_]) -> Siap:
+        with np.errstate(invalid="ignore", divide="ignore"):
+            accuracy = self._sums[[0, 2]] / self._sums[[1, 3]]
+        life = np.zeros(0)
+        if len(exists):
+            some = exists[:, exists.any(axis=0)]
+            life = (self._times[len(some) - 1 - some[::-1].argmax(axis=0)] - self._times[some.argmax(axis=0)]) / 1e9
+        counts = (exists.sum(), self._siap[:, 0].sum(), self._shown.sum(), self._siap[:, 1].sum())
+        objects, tracked, shown, assigned = map(float, counts)
+        return siap_of(
+            self._following.segments(len(self._times) - 1),
+            self._times,
+            life,
+            (objects, tracked, shown, assigned),
+            (float(accuracy[0]), float(accuracy[1])),
         )
 
 
-def averages(errors: Floats, squared: Floats) -> tuple[float, float]:
+def averages(errors: FloatArray, squared: FloatArray) -> tuple[float, float]:
     """RMSE and ANEES of pairs (R,), (R,); NaN without a pair."""
     return (float(np.sqrt(np.mean(errors**2))), float(np.mean(squared))) if len(errors) else (np.nan, np.nan)
 
@@ -294,7 +300,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _lengths(rows: Floats) -> Floats:
+def _lengths(rows: FloatArray) -> FloatArray:
     """(R, m) -> (R,), NaN where m is 0."""
     return np.sqrt((rows * rows).sum(axis=1)) if rows.shape[1] else np.full(len(rows), np.nan)
 

@@ -8,34 +8,34 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 if TYPE_CHECKING:
+    from fusion_service.review.evaluation.account import Account
     from fusion_service.review.evaluation.assess import Assessment, Evaluation
-    from fusion_service.review.evaluation.consistency import Pair
-    from fusion_service.review.evaluation.logbook import Account
+    from fusion_service.review.evaluation.consistency import SourcePair
     from fusion_service.review.evaluation.scoring import Scores
 
 __all__ = [
     "DELAYS",
     "NUMBERS",
-    "RULES",
-    "Row",
+    "ScoredCentre",
     "aligned",
     "best_rows",
     "comparison",
     "confirm_line",
-    "consistent",
     "digits",
     "fixed",
     "format_table",
     "links",
-    "metres",
     "pair_words",
     "percent",
+    "power_of_ten",
     "row_name",
     "rules_table",
     "sentence",
     "tracking_table",
     "truthless_lines",
 ]
+
+RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
 
 
 def format_table(evaluation: Evaluation) -> str:
@@ -70,6 +70,7 @@ def digits(value: float) -> str:
 
 
 def fixed(*values: float) -> str:
+    """Two decimals of each, - where one is not finite."""
     return " - ".join(f"{value:.2f}" for value in values) if np.isfinite(values).all() else "-"
 
 
@@ -86,7 +87,7 @@ def aligned(table: list[list[str]], left: int = 1, last_left: bool = False) -> l
     return lines
 
 
-class Row(NamedTuple):
+class ScoredCentre(NamedTuple):
     """One line of a comparison: which centre of which recording, its rule, its scores."""
 
     recording: str
@@ -95,7 +96,7 @@ class Row(NamedTuple):
     evaluation: Evaluation
 
 
-def sentence(row: Row) -> str:
+def sentence(row: ScoredCentre) -> str:
     """How it went, in words."""
     evaluation, fused = row.evaluation, row.evaluation.fused
     if evaluation.centre is None:
@@ -123,7 +124,7 @@ def sentence(row: Row) -> str:
     return "; ".join(text) + "."
 
 
-def row_name(row: Row, rows: Sequence[Row]) -> str:
+def row_name(row: ScoredCentre, rows: Sequence[ScoredCentre]) -> str:
     """As short as tells it from the others."""
     if len({one.rule for one in rows}) == len(rows):
         return row.rule
@@ -134,7 +135,7 @@ def row_name(row: Row, rows: Sequence[Row]) -> str:
     return f"{row.recording} ({row.rule})" if alone else f"{row.recording}, {name}"
 
 
-def comparison(rows: Sequence[Row]) -> str:
+def comparison(rows: Sequence[ScoredCentre]) -> str:
     """Which of several rows are best at what, in words."""
     fused = [row.evaluation.fused for row in rows]
     parts = []
@@ -196,14 +197,14 @@ NUMBERS = len(RULES) - 3
 """Of its columns the last ones."""
 
 
-def rules_table(rows: Sequence[Row]) -> list[list[str]]:
+def rules_table(rows: Sequence[ScoredCentre]) -> list[list[str]]:
     """A line for each centre of each recording, without the columns that say the same in all."""
     table = [list(RULES), *([*cells] for cells in map(_cells, rows))]
     dull = [k for k in range(2) if len({line[k] for line in table[1:]}) == 1]
     return [[cell for k, cell in enumerate(line) if k not in dull] for line in table]
 
 
-def _cells(row: Row) -> list[str]:
+def _cells(row: ScoredCentre) -> list[str]:
     fused = row.evaluation.fused
     numbers = (
         fused.gospa,
@@ -224,7 +225,7 @@ def _cells(row: Row) -> list[str]:
     ]
 
 
-def best_rows(rows: Sequence[Row]) -> dict[str, set[int]]:
+def best_rows(rows: Sequence[ScoredCentre]) -> dict[str, set[int]]:
     """Column of `RULES` -> the rows that are best in it; nothing where all are."""
     fused = [row.evaluation.fused for row in rows]
     ranked: dict[str, list[float]] = {
@@ -322,7 +323,7 @@ DELAYS = {
 }
 
 
-def pair_words(pair: Pair) -> str:
+def pair_words(pair: SourcePair) -> str:
     """What the agreement of two sources says."""
     if pair.mean > pair.bounds[1]:
         return "covariances too small, or biased"
@@ -365,3 +366,8 @@ def _sources(n: int) -> str:
 def percent(share: float) -> str:
     """0.05 as 5 %."""
     return f"{100 * share:.3g} %" if np.isfinite(share) else "-"
+
+
+def power_of_ten(power: int) -> str:
+    """10 with its power raised: 10⁶."""
+    return f"10{str(power).translate(RAISED)}"

@@ -15,7 +15,7 @@ from schemas.flat import frame_of, space_of
 
 __all__ = ["read_truth"]
 
-Columns = dict[str, list[Any]]
+FlatTable = dict[str, list[Any]]
 ROWS = 50_000
 
 
@@ -47,11 +47,11 @@ def _recorded(path: Path) -> Iterator[Truth]:
             yield message
 
 
-def _csv(path: Path) -> Iterator[Columns]:
+def _csv(path: Path) -> Iterator[FlatTable]:
     with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         reader = csv.DictReader(file)
         wanted = _wanted(tuple(reader.fieldnames or ()), path)
-        table: Columns = {name: [] for name in wanted}
+        table: FlatTable = {name: [] for name in wanted}
         for row in reader:
             if None in row or None in row.values():
                 raise ReviewError(f"{path}: line {reader.line_num} has not as many fields as the first: mend it")
@@ -64,7 +64,7 @@ def _csv(path: Path) -> Iterator[Columns]:
         yield table
 
 
-def _parquet(path: Path) -> Iterator[Columns]:
+def _parquet(path: Path) -> Iterator[FlatTable]:
     try:
         from pyarrow import ArrowException, parquet
     except ImportError as error:
@@ -73,7 +73,7 @@ def _parquet(path: Path) -> Iterator[Columns]:
         file = parquet.ParquetFile(path)
         wanted = _wanted(tuple(file.schema_arrow.names), path)
         for batch in file.iter_batches(ROWS, columns=list(wanted)):
-            rows: Columns = batch.to_pydict()
+            rows: FlatTable = batch.to_pydict()
             mine = [index for index, kind in enumerate(rows["kind"]) if kind == "truth"]
             yield {name: [column[index] for index in mine] for name, column in rows.items()}
     except ArrowException as error:
@@ -87,7 +87,7 @@ def _wanted(columns: tuple[str, ...], path: Path) -> tuple[str, ...]:
         raise ReviewError(f"{path}: {error}") from None
 
 
-def _messages(table: Columns, path: Path) -> Iterator[Truth]:
+def _messages(table: FlatTable, path: Path) -> Iterator[Truth]:
     space = tuple(name for name in table if name not in ("time_ns", "source", "kind", "track_id", "epoch", "frame"))
     if not table["time_ns"]:
         return

@@ -9,20 +9,19 @@ from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 
-from scipy.stats import chi2
-
 from fusion_service.config import CentreConfig, ConfigError, centre_config
-from fusion_service.errors import ReviewError
+from fusion_service.errors import ReviewError, Stopped
+from fusion_service.metrics import chi2_quantile
 from fusion_service.progress import Progress
 from fusion_service.recording import RawMessage, read
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.steps import Step, Steps
 from fusion_service.recording.survey import RecordedCentre, key_of, survey
-from fusion_service.review.explain.lives import Lives
+from fusion_service.review.explain.histories import TrackHistories
 from fusion_service.review.explain.story import Story
 from schemas import GlobalTracks, MessageError, StepLog, decode
 
-__all__ = ["Mission", "Refusals", "read_mission"]
+__all__ = ["RecordedMission", "Refusals", "read_mission"]
 
 RECENT = 8
 """Messages of a source that are looked at for what it says of a track."""
@@ -47,13 +46,13 @@ class Refusals:
 
 
 @dataclass
-class Mission:
+class RecordedMission:
     """What was read of a centre. Times in ns; start: of its first step; steps: how many; story: of the track asked
     for; config: its newest settings, None where they are not known."""
 
     path: Path
     centre: RecordedCentre
-    lives: Lives = field(default_factory=Lives)
+    histories: TrackHistories = field(default_factory=TrackHistories)
     labels: Labels = field(default_factory=Labels)
     start: int = 0
     steps: int = 0
@@ -70,8 +69,8 @@ class Mission:
         """Bounds on d2 of a new and of a standing link; NaN where the settings are not known."""
         if self.config is None or self.config.kind == "intensity":
             return math.nan, math.nan
-        new, standing = chi2.ppf([self.config.gate, self.config.keep_gate], len(self.config.space))
-        return float(new), float(standing)
+        n = len(self.config.space)
+        return chi2_quantile(self.config.gate, n), chi2_quantile(self.config.keep_gate, n)
 
 
 def read_mission(
@@ -81,7 +80,7 @@ def read_mission(
     at: str | None = None,
     centre: str | None = None,
     stop: Event | None = None,
-) -> Mission:
+) -> RecordedMission:
     """Read what a centre did, and the story of `track` (a label, or a whole id) with its moment at `at`.
 
     `ReviewError` where the recording, the track or the time is not as it must be.
@@ -89,8 +88,8 @@ def read_mission(
     stop = stop or Event()
     found = survey(path, stop)
     if stop.is_set():
-        raise ReviewError("stopped")
-    mission = Mission(found.path, found.shown(centre))
+        raise Stopped("stopped")
+    mission = RecordedMission(found.path, found.shown(centre))
     if track is not None:
         try:
             mission.labels.find(track)
@@ -101,7 +100,7 @@ def read_mission(
     with Progress("Reading") as bar:
         for number, raw in enumerate(read(path)):
             if stop.is_set():
-                raise ReviewError(f"stopped after {mission.steps} steps")
+                raise Stopped(f"stopped after {mission.steps} steps")
             reader.take(raw)
             if number % SHOWN == 0:
                 bar.show(number / found.messages, f"{mission.steps} steps")
@@ -109,7 +108,7 @@ def read_mission(
     if not mission.steps:
         raise ReviewError(f"{path}: centre {mission.centre.name} made no step that can be read")
     if track is not None and (mission.story is None or mission.story.first < 0):
-        number = len(mission.lives.known)
+        number = len(mission.histories.known)
         raise ReviewError(
             f"{path}: centre {mission.centre.name} has no track {track}: it has {number}, from "
             f"{_ends(mission)}; without --track they are listed"
@@ -120,7 +119,7 @@ def read_mission(
 class _Reader:
     """Takes the messages of a recording as they came."""
 
-    def __init__(self, mission: Mission, track: str | None, at: str | None) -> None:
+    def __init__(self, mission: RecordedMission, track: str | None, at: str | None) -> None:
         self._mission = mission
         self._track = track
         self._at = at
@@ -160,7 +159,7 @@ class _Reader:
             mission.start = step.time
             self._until = None if self._at is None else time_of(self._at, step.time)
         mission.steps += 1
-        mission.lives.step(step)
+        mission.histories.step(step)
         if step.picture is not None:
             mission.rule = step.picture.rule
         if step.log is not None:
@@ -201,7 +200,8 @@ def _starts(log: StepLog) -> bool:
 
 
 def time_of(text: str, start: int) -> int:
-    """The time, ns, that `text` says: seconds from `start`, or ISO 8601 (UTC unless it says otherwise)."""
+    """The time, ns, that `text` says: seconds from `start`, or ISO 8601 (UTC unless it says otherwise).
+    Raises `ReviewError` for another text."""
     try:
         seconds = float(text)
     except ValueError:
@@ -218,7 +218,7 @@ def time_of(text: str, start: int) -> int:
     return start + round(seconds * 1e9)
 
 
-def _ends(mission: Mission) -> str:
+def _ends(mission: RecordedMission) -> str:
     """The first and the last track there are."""
-    known = sorted(mission.lives.known)
+    known = sorted(mission.histories.known)
     return f"{mission.labels(known[0])} to {mission.labels(known[-1])}" if known else "none"

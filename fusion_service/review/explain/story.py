@@ -16,11 +16,18 @@ import numpy as np
 
 from fusion_service.recording import RawMessage
 from fusion_service.recording.steps import Step
-from fusion_service.review.explain.lives import GONE
+from fusion_service.review.explain.histories import GONE
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks, MessageError, StepLog, decode
 from schemas.messages import BORN, BROKEN, COASTING, DELETED, GATE_FAILED, KEPT, LINKED, MERGED, SPLIT, TENTATIVE
 
-__all__ = ["Happening", "Link", "Member", "Moment", "Story", "local_messages", "members_of"]
+__all__ = [
+    "Composition",
+    "Happening",
+    "Link",
+    "Member",
+    "Story",
+    "local_messages",
+]
 
 Member = tuple[str, int, int]
 """A local track: source, epoch, id."""
@@ -70,7 +77,7 @@ class Link:
             self.least, self.most = min(self.least, influence), max(self.most, influence)
 
 
-class Moment(NamedTuple):
+class Composition(NamedTuple):
     """The track after one step: its row in the picture, what its members brought, their newest d2, and the newest
     messages of their sources."""
 
@@ -82,8 +89,8 @@ class Moment(NamedTuple):
 
 
 class Story:
-    """Gathers what happened to the global track `track`. until: the time (ns) of the `moment` that is wanted, None for
-    the last step that had contributions."""
+    """Gathers what happened to the global track `track`. until: the time (ns) of the `composition` that is wanted, None
+    for the last step that had contributions."""
 
     def __init__(self, track: int, until: int | None = None) -> None:
         self.track = track
@@ -95,7 +102,7 @@ class Story:
         self.first = self.last = -1
         self.steps = 0
         self.ended: tuple[int, str, int | None] | None = None
-        self.moment: Moment | None = None
+        self.composition: Composition | None = None
         self.newest: tuple[GlobalTracks, int] | None = None
         self.supported = -1
         """Time of the last step with contributions."""
@@ -129,6 +136,8 @@ class Story:
             if kind == "start":
                 kept = "checkpoint" in event or "left_out" in event
                 self.say(at, f"the service began anew {'from its checkpoint' if kept else 'without a checkpoint'}")
+            elif kind == "era":
+                self.say(at, "the clock was set back: a new era began")
             elif kind in ("found", "lost") and source in sources:
                 self.say(at, f"{source} {'is on the bus' if kind == 'found' else 'has left the bus'}")
             elif kind == "order" and event.get("track") == self.track:
@@ -221,7 +230,7 @@ class Story:
             values = {member: self.links[member].value for member in influence}
             sources = {member[0] for member in influence}
             held = {source: tuple(recent.get(source, ())) for source in sources}
-            self.moment = Moment(picture, row, influence, values, held)
+            self.composition = Composition(picture, row, influence, values, held)
 
 
 def _change(before: int, status: int) -> str:

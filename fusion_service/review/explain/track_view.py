@@ -16,7 +16,7 @@ from fusion_service.densities import moments
 from fusion_service.recording import Recorder, read
 from fusion_service.recording.parts import unused
 from fusion_service.recording.survey import key_of
-from fusion_service.review.explain.mission import Mission
+from fusion_service.review.explain.mission import RecordedMission
 from schemas import GlobalTracks, LocalTracks, Message, MessageError, StepLog, Truth, decode, encode
 
 __all__ = ["write_view"]
@@ -27,7 +27,7 @@ TICK = 2000
 """Messages that are written at once."""
 
 
-def write_view(mission: Mission, out: str | Path, stop: Event | None = None) -> int:
+def write_view(mission: RecordedMission, out: str | Path, stop: Event | None = None) -> int:
     """Write the track of `mission.story` alone into the recording `out`. Returns how many messages it has."""
     stop = stop or Event()
     assert mission.story is not None, "the mission is read with a track"
@@ -45,7 +45,7 @@ def write_view(mission: Mission, out: str | Path, stop: Event | None = None) -> 
     return recorder.messages
 
 
-def _read(mission: Mission, text: str, data: bytes) -> Message | None:
+def _read(mission: RecordedMission, text: str, data: bytes) -> Message | None:
     """The message, if it may be about the track."""
     key = key_of(text)
     if key is None or key.realm != mission.centre.realm:
@@ -58,7 +58,7 @@ def _read(mission: Mission, text: str, data: bytes) -> Message | None:
         return None
 
 
-def _part(mission: Mission, message: Message, near: set[int]) -> Message | None:
+def _part(mission: RecordedMission, message: Message, near: set[int]) -> Message | None:
     """What of a message is about the track; None if nothing is."""
     story = mission.story
     assert story is not None
@@ -139,7 +139,7 @@ def _log(message: StepLog, track: int, sources: set[str]) -> StepLog:
     )
 
 
-def _near(mission: Mission, stop: Event) -> set[int]:
+def _near(mission: RecordedMission, stop: Event) -> set[int]:
     """The true objects that were nearest to the track in enough of its steps."""
     story = mission.story
     assert story is not None

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from datetime import UTC, datetime
 
 import numpy as np
 
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
-from fusion_service.review.explain.lives import GONE, Life
-from fusion_service.review.explain.mission import Mission, Refusals
-from fusion_service.review.explain.story import Happening, Link, Member, Moment, Story, local_messages
+from fusion_service.recording.drawing.labels import utc
+from fusion_service.review.explain.histories import GONE, TrackHistory
+from fusion_service.review.explain.mission import RecordedMission, Refusals
+from fusion_service.review.explain.story import Composition, Happening, Link, Member, Story, local_messages
 from schemas import STATUSES, LocalTracks
 from schemas.messages import COASTING, TENTATIVE
 
@@ -27,11 +27,12 @@ MARGIN = 10.0
 """Seconds around a life in which refusals are told."""
 
 
-def explanation(mission: Mission) -> str:
-    """The story of `mission.story` in words."""
+def explanation(mission: RecordedMission) -> str:
+    """The story of `mission.story` in words. Raises `ReviewError` where the track was not there at the time asked
+    for."""
     story = mission.story
     assert story is not None
-    if story.until is not None and (story.until < story.first or story.moment is None):
+    if story.until is not None and (story.until < story.first or story.composition is None):
         raise ReviewError(
             f"track {mission.labels(story.track)} was not there at {mission.seconds(story.until):.1f} s: "
             f"it lived from {mission.seconds(story.first):.1f} to {mission.seconds(story.last):.1f} s"
@@ -41,18 +42,18 @@ def explanation(mission: Mission) -> str:
     return "\n\n".join("\n".join(block) for block in blocks if block)
 
 
-def listing(mission: Mission, *, everything: bool = False) -> str:
+def listing(mission: RecordedMission, *, everything: bool = False) -> str:
     """The tracks of a mission, a line each: those that were ever confirmed, or all."""
-    lives = sorted(mission.lives, key=lambda one: (one.first, one.track))
+    lives = sorted(mission.histories, key=lambda one: (one.first, one.track))
     shown = [one for one in lives if one.confirmed or everything]
     rows = [["track", "from s", "to s", "life s", "events", "sources", "became"]]
     for one in shown:
-        until = mission.lives.until(one)
+        until = mission.histories.until(one)
         first, last = mission.seconds(one.first), mission.seconds(until)
         sources = " ".join(sorted(one.sources)) or "-"
         numbers = [f"{value:.1f}" for value in (first, last, last - first)]
         rows.append([mission.labels(one.track), *numbers, str(one.events), sources, _became(mission, one)])
-    head = f"{mission.path}: centre {mission.centre.name}, {mission.steps} steps from {_utc(mission.start)}"
+    head = f"{mission.path}: centre {mission.centre.name}, {mission.steps} steps from {utc(mission.start, 'T')}"
     left = len(lives) - len(shown)
     never = f"; {left} more were never confirmed (--all lists them)" if left else ""
     count = f"{len(shown)} track{'s' * (len(shown) != 1)}"
@@ -60,7 +61,7 @@ def listing(mission: Mission, *, everything: bool = False) -> str:
     return "\n".join([head, *_table(rows, left=(0, 5, 6)), tail])
 
 
-def _became(mission: Mission, life: Life) -> str:
+def _became(mission: RecordedMission, life: TrackHistory) -> str:
     label = mission.labels
     parts = [] if life.parent is None else [f"split from {label(life.parent)}"]
     parts += [f"took in {', '.join(map(label, life.took))}"] if life.took else []
@@ -73,7 +74,7 @@ def _became(mission: Mission, life: Life) -> str:
 class _Teller:
     """Writes the blocks of one story."""
 
-    def __init__(self, mission: Mission, story: Story) -> None:
+    def __init__(self, mission: RecordedMission, story: Story) -> None:
         self.mission, self.story = mission, story
         self.label = mission.labels
         self.new_gate, self.gate = mission.gates()
@@ -108,7 +109,7 @@ class _Teller:
         span = f"{self.time(story.first)} to {self.time(story.last)} s"
         return [
             f"track {self.label(track)}{whole} of centre {mission.centre.name} in {mission.path}",
-            f"mission from {_utc(mission.start)}, {mission.steps} steps, rule {mission.rule}{gates}",
+            f"mission from {utc(mission.start, 'T')}, {mission.steps} steps, rule {mission.rule}{gates}",
             f"lived from {span}, {story.steps} steps: {status}; {existence}",
         ]
 
@@ -156,23 +157,23 @@ class _Teller:
         return f"{one.source}: {' and '.join(parts)} refused ({one.reason})"
 
     def contributions(self) -> list[str]:
-        """What each member brought, at the moment and over the life of the track."""
-        moment, story = self.story.moment, self.story
-        if moment is None or not story.links:
+        """What each member brought, at the time asked for and over the life of the track."""
+        composition, story = self.story.composition, self.story
+        if composition is None or not story.links:
             return []
-        said = {member: _said(member, moment) for member in moment.influence}
+        said = {member: _said(member, composition) for member in composition.influence}
         rows = [["source and track", "influence", "mean", "least", "most", "steps", "d2", "age s", "sigma m", "says"]]
-        for member in sorted(story.links, key=lambda one: (one not in moment.influence, one)):
+        for member in sorted(story.links, key=lambda one: (one not in composition.influence, one)):
             link = story.links[member]
             age, sigma, identity = said.get(member, ("", "", ""))
-            here = f"{moment.influence[member]:.2f}" if member in moment.influence else "-"
-            d2 = f"{moment.values[member]:.1f}" if math.isfinite(moment.values.get(member, math.nan)) else "-"
+            here = f"{composition.influence[member]:.2f}" if member in composition.influence else "-"
+            d2 = f"{composition.values[member]:.1f}" if math.isfinite(composition.values.get(member, math.nan)) else "-"
             rows.append([self.name(member), here, *_over_life(link), str(link.steps), d2, age, sigma, identity])
         if not any(row[-1] for row in rows[1:]):
             rows = [row[:-1] for row in rows]
-        at = moment.picture.time
-        status = STATUSES[moment.picture.status[moment.row]]
-        head = f"contributions at {self.time(at)} s (step {moment.picture.step}, {status}), and over its life:"
+        at = composition.picture.time
+        status = STATUSES[composition.picture.status[composition.row]]
+        head = f"contributions at {self.time(at)} s (step {composition.picture.step}, {status}), and over its life:"
         return [head, *_table(rows, left=(0, 9))]
 
     # In plain words
@@ -184,7 +185,7 @@ class _Teller:
         story, name = self.story, self.label(self.story.track)
         born = next((one for one in story.happenings if one.what == "born"), None)
         split = next((one for one in story.happenings if one.what == "split from"), None)
-        life = self.mission.lives.known[story.track]
+        life = self.mission.histories.known[story.track]
         at = self.time(story.first)
         if born is None:
             why = "when the recording of it begins"
@@ -261,16 +262,16 @@ class _Teller:
             return f"no source had it for {silent:.1f} s{limit}"
         return reason
 
-    def _chain(self, track: int | None, following: Callable[[Life], int | None], how: str) -> list[str]:
+    def _chain(self, track: int | None, following: Callable[[TrackHistory], int | None], how: str) -> list[str]:
         """A sentence for each track of a line of ancestors or heirs."""
         said: list[str] = []
         seen = {self.story.track}
         while track is not None and track not in seen and len(said) < LONGEST_CHAIN:
             seen.add(track)
-            life = self.mission.lives.known.get(track)
+            life = self.mission.histories.known.get(track)
             if life is None:
                 break
-            until = self.time(self.mission.lives.until(life))
+            until = self.time(self.mission.histories.until(life))
             text = f"Track {self.label(track)}, from {', '.join(sorted(life.sources)) or 'no source'}, lived from"
             text = f"{text} {self.time(life.first)} to {until} s"
             track = following(life)
@@ -311,14 +312,14 @@ def _over_life(link: Link) -> list[str]:
     return [f"{value:.2f}" for value in (link.total / link.steps, link.least, link.most)]
 
 
-def _said(member: Member, moment: Moment) -> tuple[str, str, str]:
+def _said(member: Member, composition: Composition) -> tuple[str, str, str]:
     """Of the newest message of a member's source that holds it: age (s), standard deviation of its position (m), and
     what it says that it is."""
     source, epoch, local = member
-    for message in reversed(local_messages(moment.recent.get(source, ()))):
-        if message.epoch != epoch or message.time > moment.picture.time:
+    for message in reversed(local_messages(composition.recent.get(source, ()))):
+        if message.epoch != epoch or message.time > composition.picture.time:
             continue
-        age = f"{(moment.picture.time - message.time) / 1e9:.1f}"
+        age = f"{(composition.picture.time - message.time) / 1e9:.1f}"
         if not isinstance(message, LocalTracks):
             return age, "", ""
         rows = np.flatnonzero(message.ids == np.uint64(local))
@@ -343,7 +344,3 @@ def _table(rows: Sequence[Sequence[str]], left: Sequence[int]) -> list[str]:
         ]
         lines.append("  ".join(cells).rstrip())
     return lines
-
-
-def _utc(at: int) -> str:
-    return datetime.fromtimestamp(at // 10**9, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")

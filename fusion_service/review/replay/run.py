@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -22,67 +21,29 @@ from fusion_service.config import config_hash, load_config
 from fusion_service.config.settings import plain_settings
 from fusion_service.errors import ReviewError
 from fusion_service.progress import Progress
-from fusion_service.recording import read
+from fusion_service.recording import RawMessage, read
 from fusion_service.recording.steps import Step
 from fusion_service.recording.survey import RecordedCentre, Survey, key_of, survey
-from fusion_service.review.replay.bases import Bases
-from fusion_service.review.replay.following import Clocked, Follower, Player
+from fusion_service.review.replay.clock_engine import ClockEngine
+from fusion_service.review.replay.engine import Engine
+from fusion_service.review.replay.log_engine import LogEngine
+from fusion_service.review.replay.mission_settings import MissionSettings
+from fusion_service.review.replay.player import Player
 from fusion_service.review.replay.variants import variants_of
-from fusion_service.review.replay.verifying import Difference, differences, published_as
+from fusion_service.review.replay.verifying import Difference, Verdict
 from fusion_service.review.replay.writer import ReplayWriter
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, decode
 
-__all__ = ["Replay", "Verdict", "run_replay"]
+__all__ = ["Replay", "run_replay"]
 
 SHOWN = 200
 """Messages between two looks of the progress bar."""
 
 
 @dataclass
-class Verdict:
-    """What came of comparing. compared: steps; equal: those without a difference; unseen: those of which only the log
-    is recorded; first: step, its time (ns) and the first difference; largest: relative difference of numbers."""
-
-    compared: int = 0
-    equal: int = 0
-    unseen: int = 0
-    first: tuple[int, int, Difference] | None = None
-    largest: float = 0.0
-
-    def look(self, step: Step, result: StepResult) -> None:
-        """Compare a step that was made with the recorded one."""
-        assert step.log is not None
-        made, recorded = result.tracks, step.picture
-        if recorded is not None and recorded.origin == "replay" and recorded.source != made.source:
-            made = published_as(made, recorded.source)
-        self.compared += 1
-        self.unseen += recorded is None
-        equal = True
-        for one in differences(recorded, made, step.log, result.log):
-            equal = False
-            self.first = self.first or (step.number, step.time, one)
-            self.largest = max(self.largest, 0.0 if math.isnan(one.relative) else one.relative)
-        self.equal += equal
-
-    @property
-    def told(self) -> str:
-        """In a line."""
-        if self.first is None:
-            seen = f", {self.unseen} of them by their log alone" if self.unseen else ""
-            return f"{self.compared} steps made again{seen}: equal to the bit"
-        number, at, one = self.first
-        when = datetime.fromtimestamp(at / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-4] + "Z"
-        whose = f"track {one.track} ({one.track % 2**32}), " if one.track is not None else ""
-        text = f"differs first at step {number} ({when}): {whose}{one.field}: recorded {one.recorded}, made {one.made}"
-        differing = self.compared - self.equal
-        far = f", numbers by {self.largest:.2g} of themselves at most" if self.largest else ""
-        return f"{text}; {differing} of {self.compared} compared steps differ{far}"
-
-
-@dataclass
 class Replay:
-    """What a replay came to. by: log or clock; verdict: None where nothing was to be compared; most_held: messages
-    that were held at a time."""
+    """What a replay came to. by: log or clock; verdict: None where nothing was to be compared; most_buffered: messages
+    that waited for a step at a time."""
 
     path: Path
     by: str
@@ -91,7 +52,7 @@ class Replay:
     verdict: Verdict | None = None
     remarks: list[str] = field(default_factory=list)
     stopped: bool = False
-    most_held: int = 0
+    most_buffered: int = 0
 
     @property
     def passed(self) -> bool:
@@ -153,10 +114,10 @@ def run_replay(
     if not found.inputs:
         raise ReviewError(f"{path} holds no messages of sources: there is nothing to fuse")
     players = [Player(one) for one in variants_of(rules, settings, found.sources | set(found.centres))]
-    bases = Bases(found, followed, given, by_clock=clock)
-    bases.check([player.variant for player in players])
-    if verify and bases.foreign:
-        raise ReviewError(f"{config} does not hold the settings of the mission (hash {bases.foreign}): leave it out")
+    own = MissionSettings(found, followed, given, by_clock=clock)
+    own.check([player.variant for player in players])
+    if verify and own.foreign:
+        raise ReviewError(f"{config} does not hold the settings of the mission (hash {own.foreign}): leave it out")
     by_log = followed is not None and not clock
     replay = Replay(found.path, "log" if by_log else "clock", players, None if out is None else Path(out))
     replay.verdict = Verdict() if verify else None
@@ -164,10 +125,10 @@ def run_replay(
         writer = None
         if out is not None:
             writer = stack.enter_context(ReplayWriter(out, found.realm, keep_recorded=keep_recorded, draw=draw))
-        say(_first_line(replay, followed, bases))
+        say(_first_line(replay, followed, own))
         begin = time.perf_counter()
-        _play(replay, found, followed if by_log else None, bases, writer, stop)
-    replay.remarks += bases.remarks
+        _play(replay, found, followed if by_log else None, own, writer, stop)
+    replay.remarks += own.remarks
     _say_end(replay, time.perf_counter() - begin, say)
     return replay
 
@@ -176,24 +137,25 @@ def _play(
     replay: Replay,
     found: Survey,
     followed: RecordedCentre | None,
-    bases: Bases,
+    settings: MissionSettings,
     writer: ReplayWriter | None,
     stop: Event,
 ) -> None:
+    """Fuse all messages again; followed: by the step logs of this centre, None by the messages' own time."""
     verdict = replay.verdict
 
     def on_step(player: Player, result: StepResult, step: Step) -> None:
         if writer is not None:
             writer.publish(player.variant.name, result, step.received)
-        if verdict is not None and isinstance(engine, Follower) and not engine.apart:
+        if verdict is not None and not engine.apart:
             verdict.look(step, result)
 
-    engine: Follower | Clocked
+    engine: Engine
     if followed is not None:
-        engine = Follower(replay.players, bases.of, on_step)
+        engine = LogEngine(replay.players, settings.of, on_step)
     else:
-        configs = [player.variant.config(bases.first) for player in replay.players]
-        engine = Clocked(replay.players, configs, on_step)
+        configs = [player.variant.config(settings.first) for player in replay.players]
+        engine = ClockEngine(replay.players, configs, on_step)
     now, unread = 0, 0
     with Progress("Fusing") as bar:
         for number, raw in enumerate(read(found.path)):
@@ -203,46 +165,43 @@ def _play(
             now = max(now, raw.received)
             if writer is not None:
                 writer.copy(raw)
-            key = key_of(raw.key)
-            if key is None or key.realm != found.realm:
-                continue
-            ours = followed is not None and key.scope == "global" and key.name == followed.name
-            if not (ours and key.what in ("tracks", "log")) and key.scope != "local":
-                continue
             try:
-                message = decode(raw.data)
+                _feed(engine, raw, found.realm, followed)
             except MessageError:
                 unread += 1
-                continue
-            if message.source != key.name:
-                continue
-            if isinstance(message, LocalTracks | LocalIntensity | SensorInfo):
-                engine.take(message, raw.received, len(raw.data))
-            elif isinstance(message, StepLog | GlobalTracks) and isinstance(engine, Follower):
-                engine.output(message, raw.received)
-            if isinstance(engine, Follower):
-                engine.advance(raw.received)
-                replay.most_held = max(replay.most_held, engine.held)
+            replay.most_buffered = max(replay.most_buffered, engine.buffered)
             if number % SHOWN == 0:
                 steps = sum(player.steps for player in replay.players)
                 bar.show(number / max(found.messages, 1), f"{steps} steps")
+    if not replay.stopped:
+        engine.finish(now)
     if unread:
         replay.remarks.append(f"{unread} messages do not decode: they were left out")
-    if isinstance(engine, Clocked):
-        if not replay.stopped:
-            engine.finish(now)
-        replay.remarks += [f"{text} ({count} times)" for text, count in engine.remarks.items()]
-        replay.remarks += [_refusals(player) for player in replay.players if _refusals(player)]
+    if verdict is not None:
+        verdict.first = verdict.first or engine.changed
+        replay.remarks += [f"not compared: {one}" for one in engine.uncompared]
+    replay.remarks += engine.remarks()
+
+
+def _feed(engine: Engine, raw: RawMessage, realm: str, followed: RecordedCentre | None) -> None:
+    """Give `engine` a message of a source, or of the centre that is followed; `MessageError` if it does not decode."""
+    key = key_of(raw.key)
+    if key is None or key.realm != realm:
         return
-    if not replay.stopped:
-        engine.advance(None)
-    if verdict is not None and verdict.first is None:
-        verdict.first = engine.changed
-    replay.remarks += [f"not compared: {one}" for one in engine.left] if verdict is not None else []
-    replay.remarks += [text if count == 1 else f"{text} ({count} times)" for text, count in engine.remarks.items()]
+    ours = followed is not None and key.scope == "global" and key.name == followed.name
+    if not (ours and key.what in ("tracks", "log")) and key.scope != "local":
+        return
+    message = decode(raw.data)
+    if message.source != key.name:
+        return
+    if isinstance(message, LocalTracks | LocalIntensity | SensorInfo):
+        engine.input(message, raw.received, len(raw.data))
+    elif isinstance(message, StepLog | GlobalTracks):
+        engine.output(message, raw.received)
+    engine.advance(raw.received)
 
 
-def _first_line(replay: Replay, followed: RecordedCentre | None, bases: Bases) -> str:
+def _first_line(replay: Replay, followed: RecordedCentre | None, settings: MissionSettings) -> str:
     names = ", ".join(player.variant.name for player in replay.players)
     if replay.by == "log":
         assert followed is not None
@@ -250,7 +209,7 @@ def _first_line(replay: Replay, followed: RecordedCentre | None, bases: Bases) -
         how = f"{followed.logs} steps of centre {followed.name}, {what} by their logs"
     else:
         why = "--clock" if followed is not None else "no step logs in it"
-        how = f"{why}: fused as {names} by the messages' own time, {bases.told}"
+        how = f"{why}: fused as {names} by the messages' own time, {settings.told}"
     return f"{replay.path}: {how}" + (f", into {replay.out}" if replay.out is not None else "")
 
 
@@ -285,9 +244,3 @@ def _numbers(player: Player) -> dict[str, Any]:
 
 def _difference(one: Difference) -> dict[str, Any]:
     return {**one._asdict(), "relative": None if math.isnan(one.relative) else one.relative}
-
-
-def _refusals(player: Player) -> str:
-    refused = player.centre.refusals() if player.centre is not None else {}
-    told = ", ".join(f"{reason} {count}" for reason, count in refused.items())
-    return f"{player.variant.name}: refused {told}" if told else ""

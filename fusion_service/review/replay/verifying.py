@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre import StepResult
+from fusion_service.recording.steps import Step
 from schemas import DECISIONS, STATUSES, GlobalTracks, StepLog, digest
 
-__all__ = ["Difference", "differences", "published_as"]
+__all__ = ["Difference", "Verdict", "published_as"]
 
 
 class Difference(NamedTuple):
@@ -46,6 +49,47 @@ def differences(
         if codes[0] != codes[1] and not found:
             yield Difference("digest of the picture", f"{codes[0]:016x}", f"{codes[1]:016x}")
     yield from _logs(log, made_log)
+
+
+@dataclass
+class Verdict:
+    """What came of comparing. compared: steps; equal: those without a difference; unseen: those of which only the log
+    is recorded; first: step, its time (ns) and the first difference; largest: relative difference of numbers."""
+
+    compared: int = 0
+    equal: int = 0
+    unseen: int = 0
+    first: tuple[int, int, Difference] | None = None
+    largest: float = 0.0
+
+    def look(self, step: Step, result: StepResult) -> None:
+        """Compare a step that was made with the recorded one."""
+        assert step.log is not None
+        made, recorded = result.tracks, step.picture
+        if recorded is not None and recorded.origin == "replay" and recorded.source != made.source:
+            made = published_as(made, recorded.source)
+        self.compared += 1
+        self.unseen += recorded is None
+        equal = True
+        for one in differences(recorded, made, step.log, result.log):
+            equal = False
+            self.first = self.first or (step.number, step.time, one)
+            self.largest = max(self.largest, 0.0 if math.isnan(one.relative) else one.relative)
+        self.equal += equal
+
+    @property
+    def told(self) -> str:
+        """In a line."""
+        if self.first is None:
+            seen = f", {self.unseen} of them by their log alone" if self.unseen else ""
+            return f"{self.compared} steps made again{seen}: equal to the bit"
+        number, at, one = self.first
+        when = datetime.fromtimestamp(at / 1e9, UTC).strftime("%Y-%m-%dT%H:%M:%S.%f")[:-4] + "Z"
+        whose = f"track {one.track} ({one.track % 2**32}), " if one.track is not None else ""
+        text = f"differs first at step {number} ({when}): {whose}{one.field}: recorded {one.recorded}, made {one.made}"
+        differing = self.compared - self.equal
+        far = f", numbers by {self.largest:.2g} of themselves at most" if self.largest else ""
+        return f"{text}; {differing} of {self.compared} compared steps differ{far}"
 
 
 _LABELS = ("identity", "identity_p", "kind", "kind_p", "track_origin", "marks", "number", "callsign")

@@ -56,8 +56,8 @@ def test_it_is_the_joint_posterior_of_all_steps(n: int, d: int, shared: bool) ->
     z = 3 * rng.standard_normal((K, d, B))
     state = filtered(F, Q, H, R, prior, z)
     for b in range(B):
-        one = [a if shared else a[..., b] for a in (F, Q, H, R)]
-        x, P = posterior(*one, prior.mean[:, b], prior.covariance[..., b], z[..., b])
+        f, q, h, r = (a if shared else a[..., b] for a in (F, Q, H, R))
+        x, P = posterior(f, q, h, r, prior.mean[:, b], prior.covariance[..., b], z[..., b])
         np.testing.assert_allclose(state.mean[:, b], x, rtol=1e-9, atol=1e-9)
         np.testing.assert_allclose(state.covariance[..., b], P, rtol=1e-9, atol=1e-9)
 

@@ -7,6 +7,7 @@ import itertools
 from collections.abc import Callable
 from datetime import datetime, timedelta
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,11 @@ RULES: list[tuple[str, Callable[[int], Rule], int]] = [
     ("CQKF 3", partial(sigma_points.cubature_quadrature, order=3), 3),
 ]
 IDS = [name for name, _, _ in RULES]
+
+
+def apply(A: np.ndarray[Any, Any], x: Floats) -> Floats:
+    """The linear map A (m, n) of points (n, s, B)."""
+    return np.asarray(np.einsum("ij,jsb->isb", A, x))
 
 
 def spd(rng: np.random.Generator, n: int, *batch: int) -> Floats:
@@ -85,8 +91,8 @@ def test_linear_models_give_the_kalman_filter(name: str, make: Callable[[int], R
     for _ in range(5):
         z = rng.standard_normal((d, B))
         one = kalman.update(kalman.predict(one, F, Q), H, R, z)
-        other = sigma_points.predict(rule, lambda x: np.einsum("ij,jsb->isb", F, x), other, Q)
-        other = sigma_points.update(rule, lambda x: np.einsum("ij,jsb->isb", H, x), other, R, z)
+        other = sigma_points.predict(rule, lambda x: apply(F, x), other, Q)
+        other = sigma_points.update(rule, lambda x: apply(H, x), other, R, z)
     np.testing.assert_allclose(other.mean, one.mean, rtol=1e-8, atol=1e-8)
     np.testing.assert_allclose(other.covariance, one.covariance, rtol=1e-8, atol=1e-8)
 
@@ -110,9 +116,6 @@ def test_shift_and_scale_of_each_component_change_nothing_else(
 
     def h(x: Floats) -> Floats:
         return np.stack([x[0] * x[1], np.cos(x[2])])
-
-    def apply(A: Floats, x: Floats) -> Floats:
-        return np.asarray(np.einsum("ij,jsb->isb", A, x))
 
     rule = make(n)
     x = sigma_points.update(rule, h, sigma_points.predict(rule, f, state, Q), R, z)
@@ -146,7 +149,7 @@ def test_bearings_wrap() -> None:
     """A target behind the cut of the bearing is updated as the same one turned by half a turn."""
 
     def h(x: Floats) -> Floats:
-        return np.arctan2(x[1], x[0])[None]
+        return np.asarray(np.arctan2(x[1], x[0])[None])
 
     def wrap(a: Floats, b: Floats) -> Floats:
         return np.asarray((a - b + np.pi) % (2 * np.pi) - np.pi)
@@ -175,10 +178,10 @@ def test_the_ckf_is_that_of_stone_soup() -> None:
     def ranges(x: Floats) -> Floats:
         return np.stack([np.hypot(x[0], x[2]), np.hypot(x[0] - 100.0, x[2])])
 
-    class Ranges(NonLinearGaussianMeasurement):
+    class Ranges(NonLinearGaussianMeasurement):  # type: ignore[misc, unused-ignore]
         ndim_meas = 2
 
-        def function(self, state, noise=False, **kwargs):
+        def function(self, state: Any, noise: Any = False, **kwargs: Any) -> Any:
             return StateVector(ranges(np.asarray(state.state_vector, float)[:, 0]))
 
     q, R = 0.3, np.diag([5.0**2, 8.0**2])
@@ -186,7 +189,7 @@ def test_the_ckf_is_that_of_stone_soup() -> None:
     sensor = Ranges(ndim_state=4, mapping=(0, 2), noise_covar=R)
     mean, P = np.array([200.0, 3, 150, -2]), np.diag([400.0, 4, 300, 9])
     F = np.kron(np.eye(2), [[1.0, 1], [0, 1]])
-    Q = q * np.kron(np.eye(2), [[1 / 3, 1 / 2], [1 / 2, 1]])
+    Q: Floats = np.asarray(q * np.kron(np.eye(2), [[1 / 3, 1 / 2], [1 / 2, 1]]), dtype=np.float64)
     begin = datetime(2024, 1, 1)
     theirs, ours = GaussianState(mean[:, None], P, begin), Estimate(mean[:, None], P[..., None])
     rule = sigma_points.cubature(4)
@@ -196,7 +199,7 @@ def test_the_ckf_is_that_of_stone_soup() -> None:
         predicted = CubatureKalmanPredictor(motion).predict(theirs, timestamp=begin + timedelta(seconds=k))
         seen = Detection(z, timestamp=begin + timedelta(seconds=k), measurement_model=sensor)
         theirs = CubatureKalmanUpdater(sensor).update(SingleHypothesis(predicted, seen))
-        ours = sigma_points.predict(rule, lambda x: np.einsum("ij,jsb->isb", F, x), ours, Q)
+        ours = sigma_points.predict(rule, lambda x: apply(F, x), ours, Q)
         ours = sigma_points.update(rule, ranges, ours, R, z)
         np.testing.assert_allclose(ours.mean[:, 0], np.asarray(theirs.state_vector, float)[:, 0], rtol=1e-9)
         np.testing.assert_allclose(ours.covariance[..., 0], np.asarray(theirs.covar, float), rtol=1e-7, atol=1e-9)

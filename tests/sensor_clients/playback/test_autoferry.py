@@ -13,9 +13,11 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 import schemas
+from fusion_service.process import data_folder
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback import autoferry
-from sensor_clients.playback.harbour import LIDAR, RADAR, ClutterMap, HarbourSensor, HarbourTracker, cluster
+from sensor_clients.playback.following import ClutterMap
+from sensor_clients.playback.harbour import LIDAR, RADAR, HarbourSensor, HarbourTracker, cluster
 
 SECOND = 10**9
 
@@ -173,7 +175,7 @@ def gospa(tracks: Floats, truth: Floats, c: float = 20.0) -> float:
 @pytest.mark.parametrize("number", [2, 3, 5, 13, 16])
 def test_real_scenes_score_better_than_no_tracks_at_all(number: int) -> None:
     """Two missed vessels cost 20 m; each sensor alone stays below that on every scene."""
-    scenario = autoferry.load(Path(os.environ["FUSION_DATA"]), number)
+    scenario = autoferry.load(data_folder("autoferry") or Path(), number)
     truth = [(event.time, event.fields["means"]) for event in scenario.truth()]
     times = np.array([time for time, _ in truth])
     for events in (scenario.sensors["lidar"], scenario.sensors["radar"]):

@@ -15,11 +15,12 @@ import pytest
 import schemas
 from fusion_service import densities
 from fusion_service.bus import open_bus
+from fusion_service.process import data_folder
 from sensor_clients.events import Event
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback import autoferry
 from sensor_clients.playback.cameras import EO, IR, CameraSensor, CameraTracker
-from sensor_clients.playback.harbour import ClutterMap
+from sensor_clients.playback.following import ClutterMap
 from tests.helpers.processes import Hub, Program, eventually
 
 SECOND = 10**9
@@ -189,7 +190,7 @@ def test_a_camera_of_a_recording_reaches_the_bus(hub: Hub, tmp_path: Path) -> No
 @pytest.mark.parametrize("name", list(CAMERAS))
 def test_the_bearings_of_the_data_are_clockwise_from_north(name: str, number: int) -> None:
     """A return lies within 0.06 rad of a vessel far more often so than counted the other way, or from another axis."""
-    directory = Path(os.environ["FUSION_DATA"])
+    directory = data_folder("autoferry") or Path()
     scans = autoferry.read_scans(directory / f"scenario{number}_detections.json", CAMERAS[name].sensor_id)
     truth = autoferry.read_truth(directory / f"scenario{number}_groundTruth.json")
     hits = np.zeros(4)
@@ -211,7 +212,7 @@ def test_real_vessels_are_tracked_with_few_false_tracks(name: str) -> None:
     tracked = wanted = false = 0
     errors = []
     for number in (2, 3, 5, 13, 16):
-        directory = Path(os.environ["FUSION_DATA"])
+        directory = data_folder("autoferry") or Path()
         scans = autoferry.read_scans(directory / f"scenario{number}_detections.json", CAMERAS[name].sensor_id)
         truth = autoferry.read_truth(directory / f"scenario{number}_groundTruth.json")
         own = {scan.time: scan.own for scan in scans}

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from schemas import LocalIntensity, LocalTracks, SensorInfo, StepLog
 
-__all__ = ["Held", "Input"]
+__all__ = ["Input", "InputBuffer", "LocalMessage"]
 
 SENT_AGAIN = 8
 """Messages of a source and kind that its publisher sends to who comes later."""
@@ -24,21 +24,22 @@ SWEEP = 64
 MARGIN = 60.0
 """Seconds beyond `lateness` after which a message is too old."""
 
-Message = LocalTracks | LocalIntensity | SensorInfo
+LocalMessage = LocalTracks | LocalIntensity | SensorInfo
+"""What a source sends."""
 
 
 @dataclass(slots=True)
 class Input:
     """A message that a step may take; received, ns; size of it, bytes; named: whether a log has named it."""
 
-    message: Message
+    message: LocalMessage
     received: int
     size: int
     named: bool = False
 
 
-class Held:
-    """What is held. `forgotten`: how many messages no log had named when there was no more room for them."""
+class InputBuffer:
+    """Inputs under their digests. `forgotten`: how many no log had named when there was no more room for them."""
 
     def __init__(self) -> None:
         self._inputs: dict[int, Input] = {}

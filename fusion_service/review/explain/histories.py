@@ -11,11 +11,11 @@ from fusion_service.recording.steps import Step
 from schemas import GlobalTracks
 from schemas.messages import KEPT, TENTATIVE
 
-__all__ = ["GONE", "Life", "Lives"]
+__all__ = ["GONE", "TrackHistories", "TrackHistory"]
 
 
 @dataclass(slots=True)
-class Life:
+class TrackHistory:
     """One track, times in ns. events: decisions about it but links kept; confirmed: whether it ever was; ended: time,
     reason and heir; parent: what it was split from; took: tracks that were merged into it."""
 
@@ -34,16 +34,16 @@ GONE = "gone without a word"
 """The reason of a track that a picture does not show any more and none has ended."""
 
 
-class Lives:
+class TrackHistories:
     """All lives of a centre, gathered step by step."""
 
     def __init__(self) -> None:
-        self.known: dict[int, Life] = {}
+        self.known: dict[int, TrackHistory] = {}
         self.last = 0
         """Time of the newest step, ns."""
         self._before: GlobalTracks | None = None
 
-    def __iter__(self) -> Iterator[Life]:
+    def __iter__(self) -> Iterator[TrackHistory]:
         return iter(self.known.values())
 
     def step(self, step: Step) -> None:
@@ -85,10 +85,10 @@ class Lives:
         for track, source in set(zip(owner.tolist(), picture.contributor_source.tolist(), strict=True)):
             self.known[track].sources.add(picture.sources[source])
 
-    def _life(self, track: int, at: int) -> Life:
-        return self.known.setdefault(track, Life(track, at, at))
+    def _life(self, track: int, at: int) -> TrackHistory:
+        return self.known.setdefault(track, TrackHistory(track, at, at))
 
-    def until(self, life: Life) -> int:
+    def until(self, life: TrackHistory) -> int:
         """Time of the newest step in which the track was there."""
         return life.last if life.ended is not None else self.last
 

@@ -1,4 +1,5 @@
-"""Sizes, durations and moments as people write them: 500MB, 20 GB, 90s, 1h, 7d, 2026-01-31T12:00:00Z."""
+"""Values of options as people write them: 500MB, 90s, 7d, 2026-01-31T12:00:00Z, a port. All raise ValueError in one
+line; `fusion_service.process.argument` makes the type of an argument of one, and `positive` and `whole` stand there."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ import math
 import re
 from datetime import UTC, datetime
 
-__all__ = ["duration", "moment", "size"]
+__all__ = ["duration", "moment", "port", "size"]
 
 SIZES = {"b": 1, "": 1} | {
     f"{prefix}{suffix}": base**power
@@ -18,18 +19,19 @@ TEXT = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)", re.ASCII)
 
 
 def size(text: str) -> int:
-    """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500` 500 bytes. `ValueError` in one line."""
+    """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500` 500 bytes. Raises ValueError in one line."""
     value = _value(text, SIZES, "a size: give a number and B, kB, MB, GB, TB or KiB, MiB, GiB, as in 500MB")
     return math.ceil(value)
 
 
 def duration(text: str) -> float:
-    """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. `ValueError` in one line."""
+    """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. Raises ValueError in one line."""
     return _value(text, SECONDS, "a duration: give a number and s, min, h, d or w, as in 1h")
 
 
 def moment(text: str) -> tuple[str, float]:
-    """A duration from now, ("for", seconds), or a time, ("until", ns UTC), in ISO 8601. `ValueError` in one line."""
+    """A duration from now, ("for", seconds), or a time in ISO 8601, ("until", ns UTC). Raises ValueError in one
+    line."""
     try:
         return "for", duration(text)
     except ValueError:
@@ -39,6 +41,13 @@ def moment(text: str) -> tuple[str, float]:
     except ValueError:
         raise ValueError(f"{text!r} is not a time: give a duration, as in 10min, or 2026-01-31T12:00:00Z") from None
     return "until", round(when.replace(tzinfo=when.tzinfo or UTC).timestamp()) * 10**9
+
+
+def port(text: str) -> int:
+    """A TCP port. Raises ValueError in one line."""
+    if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
+        raise ValueError(f"{text!r} is not a port")
+    return int(text)
 
 
 def _value(text: str, units: dict[str, float] | dict[str, int], what: str) -> float:

@@ -12,22 +12,23 @@ from fusion_service.errors import ReviewError
 from fusion_service.recording.survey import RecordedCentre, Survey
 from fusion_service.review.replay.variants import Variant
 
-__all__ = ["Base", "Bases"]
+__all__ = ["MissionSettings", "RunSettings"]
 
 
-class Base(NamedTuple):
-    """Tables of a config; why they may not be those of the run, empty where they are; own: whether they are known to
-    be the mission's."""
+class RunSettings(NamedTuple):
+    """The settings of one run: tables of a config; doubt: why they may not be its, empty where they are; own: whether
+    they are known to be the mission's."""
 
     tables: Mapping[str, Any]
     doubt: str = ""
     own: bool = True
 
 
-class Bases:
+class MissionSettings:
     """The settings of each run of the centre that is followed. given: of a config file, above what is recorded.
 
     foreign: the hash of `given` where no run had these settings. first: those of the first run. told: in words.
+    Raises `ReviewError` where the settings are not in the recording, or cannot be used.
     """
 
     def __init__(
@@ -75,16 +76,16 @@ class Bases:
                 self._doubts[code] = f"the settings in the log have hash {config_hash(config)}, the log says {code}"
 
     def check(self, variants: Sequence[Variant]) -> None:
-        """Let every variant be made of every base. `ConfigError` says what cannot be."""
+        """Let every variant be made of the settings of every run. `ConfigError` says what cannot be."""
         for variant in variants:
             for tables in [self.first, *(() if self._given else self._recorded.values())]:
                 variant.config(tables)
 
-    def of(self, code: str) -> Base:
+    def of(self, code: str) -> RunSettings:
         """The settings of a run whose log has this hash."""
         if self._given is not None:
-            return Base(self._given, own=not self.foreign)
+            return RunSettings(self._given, own=not self.foreign)
         if code in self._recorded:
             doubt = self._doubts.get(code, "")
-            return Base(self._recorded[code], doubt, not doubt)
-        return Base(self.first, "the settings of the run are not in the recording", False)
+            return RunSettings(self._recorded[code], doubt, not doubt)
+        return RunSettings(self.first, "the settings of the run are not in the recording", False)

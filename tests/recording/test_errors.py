@@ -13,7 +13,7 @@ from scipy.stats import binomtest, chi2
 
 from fusion_service.recording import Recorder
 from fusion_service.recording.columns import Stamp
-from fusion_service.recording.drawing.errors import Assessment, Score
+from fusion_service.recording.drawing.errors import StepErrors, TruthMatcher
 from schemas import Message, encode, global_key, local_key
 from tests.helpers import missions
 from tests.recording.contents import entities, key_of, record, row, rows, texts
@@ -52,21 +52,22 @@ def test_a_consistent_centre_stays_within_the_bounds(flown: tuple[Path, list[Sen
     assert np.sqrt(np.mean(np.square(errors))) == pytest.approx(SIGMA * math.sqrt(2), rel=0.1)
 
 
-def scores(*said: Message, cutoff: float | None = None) -> list[Score]:
-    assessment, found = Assessment(cutoff), []
+def scores(*said: Message, cutoff: float | None = None) -> list[StepErrors]:
+    matcher, found = TruthMatcher(cutoff), []
     for message in said:
         if message.type == "truth":
-            assessment.truth(message)  # type: ignore[arg-type]
+            matcher.truth(message)  # type: ignore[arg-type]
         else:
-            assessment.step(message, Stamp(0, message.time))  # type: ignore[arg-type, union-attr]
-        found += list(assessment.scores())
+            matcher.step(message, Stamp(0, message.time))  # type: ignore[arg-type, union-attr]
+        found += list(matcher.matched())
     return found
 
 
 def test_truth_is_interpolated_and_waited_for() -> None:
     shown = missions.picture(1.25, [7], [(2, 5)])
     before, after = missions.truth(1, [1], [(-4, 0)]), missions.truth(2, [1], [(8, 4)])
-    for order in ([shown, before, after], [before, shown, after], [before, after, shown]):
+    orders: list[list[Message]] = [[shown, before, after], [before, shown, after], [before, after, shown]]
+    for order in orders:
         (score,) = scores(*order)
         assert score.ids.tolist() == [1]
         assert score.error == pytest.approx([5.0])  # (-1, 1) to (2, 5)

@@ -7,14 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.linalg import FloatArray
 from fusion_service.review.evaluation.scoring import Scores, averages, bounds
 
-__all__ = ["shared_pairs"]
-
-Floats = NDArray[np.float64]
+__all__ = ["fusion_gain"]
 
 
-def shared_pairs(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: int) -> dict[str, dict[str, Any]]:
+def fusion_gain(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d: int) -> dict[str, dict[str, Any]]:
+    """`Evaluation.shared`: by how many sources had an assigned track, the numbers of those pairs.
+
+    seen (K, T): how many sources had a track on each target at each time; d: dimension of the position.
+    """
     classes = {f"seen_by_{n}": seen == n for n in range(2, len(sources) + 1)} | {"seen_by_2_or_more": seen >= 2}
     both = (seen >= 2) & np.isfinite(fused.errors)
     best, best_nees = _best_single(sources, both)
@@ -35,7 +38,7 @@ def shared_pairs(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], 
     return shared
 
 
-def _best_single(sources: list[Scores], both: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _best_single(sources: list[Scores], both: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
     """Error and NEES of the best single source on the pairs `both` (K, T), R of them: of those that saw the target
     then, the one with the least mean square on all the pairs of this target that the same sources saw."""
     _, group = np.nonzero(both)

@@ -6,17 +6,15 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service.errors import ReviewError
+from fusion_service.linalg import FloatArray
 from fusion_service.review.evaluation.logbook import Logbook
-from fusion_service.review.snapshots import STALE_PERIODS, STALE_STEPS, truth_path, truth_positions
+from fusion_service.review.snapshots import STALE_PERIODS, STALE_STEPS, Times, truth_path, truth_positions
 from schemas import Frame, Motion, Truth
 
-__all__ = ["Ground", "NothingToScoreError", "ScoredTruth", "all_times", "lay_ground", "scored_truth"]
+__all__ = ["NothingToScoreError", "Reference", "ScoredTruth", "all_times", "reference_for", "scored_truth"]
 
-Floats = NDArray[np.float64]
-Times = NDArray[np.int64]
 
 MOST_TIMES = 5_000_000
 
@@ -25,7 +23,7 @@ class NothingToScoreError(ReviewError):
     """There is nothing to score, or not what was asked for."""
 
 
-class Ground(NamedTuple):
+class Reference(NamedTuple):
     """What all are scored on. sources: those that can be; motions, limits (s): of each of them and of each centre."""
 
     frame: Frame
@@ -44,17 +42,22 @@ class ScoredTruth(NamedTuple):
 
     times: Times
     targets: tuple[int, ...]
-    states: Floats
+    states: FloatArray
 
 
-def lay_ground(
+def reference_for(
     book: Logbook,
     centres: Sequence[str],
     frame: Frame | None,
     space: tuple[str, ...] | None,
     motion: Motion | None,
     c: float,
-) -> Ground:
+) -> Reference:
+    """The reference of a mission; frame and space: by default those of the first picture of the first of `centres`.
+
+    motion: of sources without an info. c: the cut-off, m. Raises `NothingToScoreError` for a centre without tracks, and
+    where nothing says a frame and a space.
+    """
     for name in centres:
         if name not in book.centres:
             there = ", ".join(book.centres) or "none"
@@ -79,16 +82,19 @@ def lay_ground(
         motions["global", name] = drift
         limits["global", name] = STALE_STEPS * book.traffic["global", name].interval
     speeds = tuple(f"v{name}" for name in axes)
-    return Ground(frame, axes, speeds, sources, list(centres), left_out, motions, limits, c)
+    return Reference(frame, axes, speeds, sources, list(centres), left_out, motions, limits, c)
 
 
 def scored_truth(
-    truths: Sequence[Truth], ground: Ground, pictures: Times | None, every: float | None, gap: float
+    truths: Sequence[Truth], reference: Reference, pictures: Times | None, every: float | None, gap: float
 ) -> ScoredTruth:
-    """ValueError where there is none."""
+    """The states of all targets at the scored times: `pictures` (K,) ns, or every so many seconds; gap: s.
+
+    Raises `NothingToScoreError`, and `ValueError` as of `truth_path`, where there is none.
+    """
     if every is None and pictures is None:
         raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
-    paths = truth_path(truths, ground.frame, ground.axes, ground.speeds)
+    paths = truth_path(truths, reference.frame, reference.axes, reference.speeds)
     if not paths:
         raise NothingToScoreError("no truth to score against")
     first, last = min(int(known[0]) for known, _ in paths.values()), max(int(known[-1]) for known, _ in paths.values())
@@ -102,11 +108,12 @@ def scored_truth(
             "no time to score: no picture of the centre, or no multiple of every, while there is truth"
         )
     states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
-    states[~np.isfinite(states[:, :, : len(ground.axes)]).all(axis=2)] = np.nan
+    states[~np.isfinite(states[:, :, : len(reference.axes)]).all(axis=2)] = np.nan
     return ScoredTruth(times, tuple(paths), states)
 
 
 def all_times(book: Logbook, pictures: Times | None, every: float | None) -> Times:
+    """The times (K,), ns, at which a mission without truth is looked at."""
     if every is None:
         return pictures if pictures is not None else np.zeros(0, dtype=np.int64)
     return _multiples(*book.span, every) if book.span else np.zeros(0, dtype=np.int64)

@@ -1,0 +1,211 @@
+"""Which local tracks may belong to which global tracks in a step, and how far they are from what the others say.
+
+Nodes are the global tracks, at the fusion of the local tracks that are believed in them (at their prediction where
+there is none), and the loose rows: those with a new datum that have no link or have failed its gate. A row is compared
+with a track as that track is without the row's own source, so that no source vouches for itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.centre.association import candidate_pairs, overlap, pair_distance
+from fusion_service.centre.gating import Judgement
+from fusion_service.centre.identity import Terms
+from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.meeting import Meeting
+from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.densities import Mixtures
+
+__all__ = ["Candidates", "Pairs", "find_candidates"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Bools = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Pairs:
+    """K pairs (first, second), in order, with d2 and log det of the sum of their covariances."""
+
+    first: Ints
+    second: Ints
+    distance: Floats
+    spread: Floats
+
+    def take(self, some: NDArray[np.bool_] | Ints) -> Pairs:
+        """Those given."""
+        return Pairs(self.first[some], self.second[some], self.distance[some], self.spread[some])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Candidates:
+    """Pairs within the gate: of global tracks (rows of the picture); of loose rows and tracks; of believed rows and
+    other tracks near theirs; of loose rows of different sources. own (M,): what a believed row's own track costs it,
+    d2 + log det, NaN for others. loose: the loose rows. mean (n, G), covariance (n, n, G): the tracks now."""
+
+    tracks: Pairs
+    joins: Pairs
+    rivals: Pairs
+    births: Pairs
+    own: Floats
+    loose: Ints
+    mean: Floats
+    covariance: Floats
+
+
+def find_candidates(
+    rows: Rows, now: Picture, meeting: Meeting, judged: Judgement, gate: float, places: list[int]
+) -> Candidates:
+    """All that may meet. now: the picture predicted to the step."""
+    tracks, agreed = rows.tracks, judged.agreed
+    mean, covariance = now.mean.copy(), now.covariance.copy()
+    at = now.find(agreed.labels)
+    mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
+    loose = np.flatnonzero(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
+    known = np.flatnonzero(now.time >= 0)
+    means = np.concatenate([mean[:, known], tracks.mean[:, loose]], axis=1)
+    covariances = np.concatenate([covariance[:, :, known], tracks.covariance[:, :, loose]], axis=2)
+    source = np.concatenate([np.full(len(known), -1), rows.source[loose]])
+    compartment = np.concatenate([meeting.compartment_of_tracks[known], meeting.compartment_of_rows[loose]])
+    sigma = np.sqrt(sum(covariances[place, place] for place in places))
+    i, j = candidate_pairs(means[places], sigma, float(np.sqrt(gate)), source)
+    same = compartment[i] == compartment[j]
+    i, j = i[same], j[same]
+    first_row, second_row = i >= len(known), j >= len(known)
+    node = np.concatenate([known, loose])
+    both, none = ~second_row, first_row
+    parts = _mixtures(now, known, rows, loose)
+    pairs_gg = _gated(means, covariances, i[both], j[both], gate, parts)
+    pairs_rr = _gated(means, covariances, i[none], j[none], gate, parts)
+    mixed = ~both & ~none
+    lookup = _Without(rows, now, judged, mean, covariance)
+    row, track = node[j[mixed]], node[i[mixed]]
+    joins = lookup.pairs(row, track, gate, _own_mixtures(now, rows))
+    row, track = _near_own(rows, now, judged.inside, pairs_gg, known)
+    rivals = lookup.pairs(row, track, gate, None)
+    own = np.full(len(tracks.id), np.nan)
+    mine = np.unique(rivals.first)
+    own[mine] = lookup.cost(mine, now.find(tracks.link[mine]))
+    gg = Pairs(known[pairs_gg.first], known[pairs_gg.second], pairs_gg.distance, pairs_gg.spread)
+    rr = Pairs(node[pairs_rr.first], node[pairs_rr.second], pairs_rr.distance, pairs_rr.spread)
+    return _said(Candidates(gg, joins, rivals, rr, own, loose, mean, covariance), rows, now, meeting)
+
+
+def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candidates:
+    """Those of them that orders and identities allow, and what these say of one target against two counted as the
+    states are: minus twice the log-likelihood ratio in what a pair costs."""
+    own = near.own.copy()
+    mine = np.flatnonzero(np.isfinite(own))
+    own[mine] -= 2.0 * meeting.with_tracks(mine, now.find(rows.tracks.link[mine])).ratio
+    joins, rivals = (pairs.take(~np.isin(pairs.first, meeting.forced_row)) for pairs in (near.joins, near.rivals))
+    return replace(
+        near,
+        tracks=near.tracks.take(~meeting.of_tracks(near.tracks.first, near.tracks.second)),
+        joins=_allowed(joins, meeting.with_tracks),
+        rivals=_allowed(rivals, meeting.with_tracks),
+        births=_allowed(near.births, meeting.with_rows),
+        own=own,
+    )
+
+
+def _allowed(pairs: Pairs, say: Callable[[Ints, Ints], Terms]) -> Pairs:
+    terms = say(pairs.first, pairs.second)
+    return replace(pairs, spread=pairs.spread - 2.0 * terms.ratio).take(~terms.forbidden)
+
+
+class _Without:
+    """Global tracks without a given source: the fusion of the others where there are others, else the prediction."""
+
+    def __init__(self, rows: Rows, now: Picture, judged: Judgement, mean: Floats, covariance: Floats) -> None:
+        self._rows, self._now, self._judged = rows, now, judged
+        self._mean, self._covariance = mean, covariance
+        self._width = max(len(now.id), 1)
+        inside = judged.inside
+        keys = rows.source[inside] * self._width + now.find(rows.tracks.link[inside])
+        self._order = np.argsort(keys, kind="stable")
+        self._keys = keys[self._order]
+
+    def state(self, row: Ints, track: Ints) -> tuple[Floats, Floats]:
+        """Mean (n, K) and covariance (n, n, K) of the tracks without the sources of the rows."""
+        mean, covariance = self._mean[:, track], self._covariance[:, :, track]
+        if len(self._keys):
+            key = self._rows.source[row] * self._width + track
+            at = np.minimum(np.searchsorted(self._keys, key), len(self._keys) - 1)
+            mine = np.flatnonzero(self._keys[at] == key)
+            place = self._order[at[mine]]
+            agreed = self._judged.agreed
+            others = agreed.size[place] > 1
+            some, alone = mine[others], mine[~others]
+            mean[:, some] = agreed.others_mean[:, place[others]]
+            covariance[:, :, some] = agreed.others_covariance[:, :, place[others]]
+            mean[:, alone] = self._now.mean[:, track[alone]]
+            covariance[:, :, alone] = self._now.covariance[:, :, track[alone]]
+        return mean, covariance
+
+    def _distances(self, row: Ints, track: Ints) -> tuple[Floats, Floats]:
+        mean, covariance = self.state(row, track)
+        spread = covariance + self._rows.tracks.covariance[:, :, row]
+        return linalg.quadratic(spread, self._rows.tracks.mean[:, row] - mean), linalg.logdet(spread)
+
+    def cost(self, row: Ints, track: Ints) -> Floats:
+        """d2 + log det (K,)."""
+        distance, spread = self._distances(row, track)
+        return distance + spread
+
+    def pairs(self, row: Ints, track: Ints, gate: float, mixtures: tuple[Mixtures, Mixtures] | None) -> Pairs:
+        """Those of the pairs that are within the gate, in order; of mixtures the d2 of their nearest components."""
+        order = np.lexsort((track, row))
+        row, track = row[order], track[order]
+        distance, spread = self._distances(row, track)
+        if mixtures is not None:
+            mine, its = mixtures
+            several = np.isfinite(mine.log_weights).sum(axis=0)[row] > 1
+            several |= np.isfinite(its.log_weights).sum(axis=0)[track] > 1
+            at = np.flatnonzero(several)
+            distance[at], spread[at] = overlap(mine.take(row[at]), its.take(track[at]))
+        return Pairs(row, track, distance, spread).take(distance <= gate)
+
+
+def _gated(means: Floats, covariances: Floats, i: Ints, j: Ints, gate: float, parts: Mixtures | None) -> Pairs:
+    distance, spread = pair_distance(means, covariances, i, j)
+    if parts is not None:
+        several = np.isfinite(parts.log_weights).sum(axis=0) > 1
+        at = np.flatnonzero(several[i] | several[j])
+        distance[at], spread[at] = overlap(parts.take(i[at]), parts.take(j[at]))
+    return Pairs(i, j, distance, spread).take(distance <= gate)
+
+
+def _near_own(rows: Rows, now: Picture, inside: Ints, near: Pairs, known: Ints) -> tuple[Ints, Ints]:
+    """Every believed row with a new datum, and each track near its own: (row, track)."""
+    fresh = inside[rows.fresh[inside]]
+    if not len(near.first) or not len(fresh):
+        return fresh[:0], fresh[:0]
+    a, b = known[near.first], known[near.second]
+    one, other = np.concatenate([a, b]), np.concatenate([b, a])
+    order = np.lexsort((other, one))
+    one, other = one[order], other[order]
+    own = now.find(rows.tracks.link[fresh])
+    first, last = np.searchsorted(one, own, "left"), np.searchsorted(one, own, "right")
+    number = last - first
+    row = np.repeat(fresh, number)
+    at = np.arange(len(row)) - np.repeat(np.cumsum(number) - number, number) + np.repeat(first, number)
+    return row, other[at]
+
+
+def _mixtures(now: Picture, known: Ints, rows: Rows, loose: Ints) -> Mixtures | None:
+    """The densities of the nodes as mixtures, where any of them is one."""
+    if not len(now.log_weight) and not len(rows.tracks.log_weight):
+        return None
+    return Mixtures.joined([now.mixtures(known), rows.tracks.mixtures(loose)])
+
+
+def _own_mixtures(now: Picture, rows: Rows) -> tuple[Mixtures, Mixtures] | None:
+    if not len(now.log_weight) and not len(rows.tracks.log_weight):
+        return None
+    return rows.tracks.mixtures(slice(None)), now.mixtures(slice(None))

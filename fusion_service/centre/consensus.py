@@ -1,0 +1,107 @@
+"""What the local tracks of one global track say together, and what each of them says of the others.
+
+The fusion here is covariance intersection with equal weights: it decides nothing but who agrees with whom, so it need
+not be the rule of the picture, and it promises to be conservative whatever the correlation of the sources.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.centre.association import by_size, uniform_ci
+
+__all__ = ["Consensus", "consensus"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+SOUND = 1e-8
+"""Least pivot, relative to its variance, of an information matrix that is inverted; below, `uniform_ci` decides."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Consensus:
+    """Of M rows in G groups: mean (n, G) and covariance (n, n, G) of all rows of each group; others_mean (n, M) and
+    others_covariance (n, n, M) of the group without the row (NaN where it is alone); size (M,) of its group."""
+
+    labels: NDArray[np.uint64]
+    mean: Floats
+    covariance: Floats
+    others_mean: Floats
+    others_covariance: Floats
+    size: Ints
+
+
+def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) -> Consensus:
+    """Of rows (n, M), (n, n, M) with labels (M,). Groups come in the order of their label.
+
+    All but one: sums of information from the left and from the right of each row, so N rows cost 2 N sums and not N^2.
+    """
+    n, count = means.shape
+    unique = np.unique(labels)
+    mean, covariance = np.empty((n, len(unique))), np.empty((n, n, len(unique)))
+    others_mean, others_covariance = np.full((n, count), np.nan), np.full((n, n, count), np.nan)
+    size = np.ones(count, dtype=np.intp)
+    for names, rows in by_size(labels):
+        at = np.searchsorted(unique, names)
+        k = rows.shape[1]
+        size[rows] = k
+        if k == 1:
+            mean[:, at], covariance[:, :, at] = means[:, rows[:, 0]], covariances[:, :, rows[:, 0]]
+            continue
+        columns = [rows[:, j] for j in range(k)]
+        xs, Ps = [means[:, one] for one in columns], [covariances[:, :, one] for one in columns]
+        if k == 2:
+            mean[:, at], covariance[:, :, at] = uniform_ci(np.stack(xs), np.stack(Ps))
+            for here, there in ((0, 1), (1, 0)):
+                others_mean[:, columns[here]], others_covariance[:, :, columns[here]] = xs[there], Ps[there]
+            continue
+        whole, without = _all_but_one(xs, Ps)
+        mean[:, at], covariance[:, :, at] = whole
+        for one, (x, P) in zip(columns, without, strict=True):
+            others_mean[:, one], others_covariance[:, :, one] = x, P
+    return Consensus(unique, mean, covariance, others_mean, others_covariance, size)
+
+
+def _all_but_one(xs: list[Floats], Ps: list[Floats]) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:
+    """Fusion of all k rows of B groups, and of all but each."""
+    k = len(xs)
+    swept = [linalg.sweep(P) for P in Ps]
+    least = swept[0][2]
+    for _, _, margin in swept[1:]:
+        least = np.minimum(least, margin)
+    information = [one[0] for one in swept]
+    vectors = [linalg.matvec(Y, x) for Y, x in zip(information, xs, strict=True)]
+    right: list[tuple[Floats, Floats] | None] = [None] * k
+    for j in range(k - 1, 0, -1):
+        after = right[j] if j < k - 1 else None
+        now = (information[j], vectors[j])
+        right[j - 1] = now if after is None else (after[0] + now[0], after[1] + now[1])
+    left: tuple[Floats, Floats] | None = None
+    without = []
+    for j in range(k):
+        parts = [part for part in (left, right[j]) if part is not None]
+        Y, y = parts[0] if len(parts) == 1 else (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
+        chosen = [i for i in range(k) if i != j]
+        without.append(_inverted(Y, y, least, [xs[i] for i in chosen], [Ps[i] for i in chosen]))
+        left = (information[j], vectors[j]) if left is None else (left[0] + information[j], left[1] + vectors[j])
+    assert left is not None
+    return _inverted(*left, least, xs, Ps), without
+
+
+def _inverted(
+    information: Floats, vector: Floats, least: Floats, xs: list[Floats], Ps: list[Floats]
+) -> tuple[Floats, Floats]:
+    """Mean and covariance of an equal-weight intersection of k sources, from their summed information."""
+    inverse, _, margin = linalg.sweep(information)
+    x, P = linalg.matvec(inverse, vector), inverse * float(len(xs))
+    sound = (np.minimum(least, margin) > SOUND) & np.isfinite(x).all(axis=0) & np.isfinite(P).all(axis=(0, 1))
+    bad = np.flatnonzero(~sound)
+    if len(bad):
+        x[:, bad], P[:, :, bad] = uniform_ci(
+            np.stack([one[:, bad] for one in xs]), np.stack([one[:, :, bad] for one in Ps])
+        )
+    return x, P

@@ -1,0 +1,180 @@
+"""Which linked local tracks are believed in a step, and which links new data have broken.
+
+Every new datum is compared with what the centre itself predicted for its global track, a manoeuvre allowed for
+(`manoeuvre`, an acceleration of any direction over the time since the last datum), and then with what the other
+sources in the track say now. One that fails is left out of the fusion until its source says something else. Where two
+disagree, the prediction decides which of them is left out; of one global track one row at a time, so that a wrong row
+cannot take the right ones with it. What is found adds to the sums of `evidence`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.centre.consensus import Consensus, consensus
+from fusion_service.centre.evidence import Tests
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import set_links
+from schemas import messages
+
+__all__ = ["Judgement", "Settings", "judge", "manoeuvred"]
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
+Bools = NDArray[np.bool_]
+AXES = (("x", "vx", "ax"), ("y", "vy", "ay"), ("z", "vz", "az"))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Judgement:
+    """inside: rows that are fused in this step, in order, and `agreed`, what they say together and of each other.
+    broken (B,): rows whose link was broken now, and was (B,): the global id it led to."""
+
+    inside: Ints
+    agreed: Consensus
+    broken: Ints
+    was: NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What of a config the judgement needs."""
+
+    tests: Tests
+    space: tuple[str, ...]
+    manoeuvre: float
+
+
+def manoeuvred(space: tuple[str, ...], acceleration: float, seconds: Floats) -> Floats:
+    """Covariance (n, n, M) of what a constant unknown acceleration (one sigma, m/s2, each axis alike) makes of a
+    state in so many seconds (M,)."""
+    spread = np.zeros((len(space), len(space), len(seconds)))
+    gains = (0.5 * seconds**2, seconds, np.ones_like(seconds))
+    for axis in AXES:
+        there = [(space.index(name), gain) for name, gain in zip(axis, gains, strict=True) if name in space]
+        for i, one in there:
+            for j, other in there:
+                spread[i, j] = acceleration**2 * one * other
+    return spread
+
+
+def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings, journal: Journal) -> Judgement:
+    """Judge the linked rows in the step at `time`, ns, writing their columns of links. now: the picture predicted
+    to it; forced: rows whose links no evidence breaks."""
+    tracks, linked, tests = rows.tracks, rows.linked(), settings.tests
+    links = tracks.link[linked]
+    fresh = rows.fresh[linked]
+    predicted = _from_prediction(rows, linked, now, time, settings)
+    jumped = fresh & (predicted > tests.keep)
+    outside = np.where(fresh, jumped, tracks.outside[linked])
+    some = np.flatnonzero(~outside)
+    agreed = consensus(links[some], tracks.mean[:, linked[some]], tracks.covariance[:, :, linked[some]])
+    distance = np.full(len(linked), np.nan)
+    distance[some] = _from_others(rows, linked[some], agreed)
+    failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep)
+    outside[failed] = True
+    _weigh(rows, linked, distance, predicted, jumped, agreed.size, some, tests)
+    tracks.outside[linked] = outside
+    tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
+    tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
+    tracks.data[linked] += fresh
+    may = fresh & ~np.isin(linked, forced)
+    broken, was = _break(rows, linked, links, may, distance, predicted, tests, journal)
+    stays = tracks.link[linked] != NO_TRACK
+    shown = np.where(np.isnan(distance), np.where(outside, predicted, np.nan), distance)
+    for kind, which in ((messages.KEPT, stays & ~outside), (messages.GATE_FAILED, stays & outside)):
+        journal.decide(kind, rows, linked[which], links[which], shown[which])
+    inside = rows.inside()
+    if len(inside) != len(some) or len(failed):
+        agreed = consensus(tracks.link[inside], tracks.mean[:, inside], tracks.covariance[:, :, inside])
+    return Judgement(inside, agreed, broken, was)
+
+
+def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings) -> Floats:
+    """d2 (L,) of each linked row to the prediction of its global track, a manoeuvre allowed for."""
+    tracks = rows.tracks
+    at = now.find(tracks.link[linked])
+    seconds = np.maximum(time - now.seen[at], 0) / 1e9
+    spread = tracks.covariance[:, :, linked] + now.covariance[:, :, at]
+    spread += manoeuvred(settings.space, settings.manoeuvre, seconds)
+    distance = linalg.quadratic(spread, tracks.mean[:, linked] - now.mean[:, at])
+    return np.where(now.time[at] >= 0, np.where(np.isnan(distance), np.inf, distance), 0.0)
+
+
+def _from_others(rows: Rows, some: Ints, agreed: Consensus) -> Floats:
+    """d2 (S,) of each row to the others of its track, NaN where it is alone."""
+    distance = np.full(len(some), np.nan)
+    several = np.flatnonzero(agreed.size > 1)
+    at = some[several]
+    spread = rows.tracks.covariance[:, :, at] + agreed.others_covariance[:, :, several]
+    distance[several] = linalg.quadratic(spread, rows.tracks.mean[:, at] - agreed.others_mean[:, several])
+    return distance
+
+
+def _worst(
+    links: NDArray[np.uint64], fresh: Bools, distance: Floats, predicted: Floats, since: NDArray[np.int64], bad: Bools
+) -> Ints:
+    """Of the bad rows of each global track with new data the one to leave out: farthest from the others, then from
+    the prediction, then youngest, then last in order."""
+    at = np.flatnonzero(bad)
+    at = at[np.isin(links[at], links[fresh])]
+    if not len(at):
+        return at
+    order = np.lexsort((-at, -since[at], -predicted[at], -distance[at], links[at]))
+    first = np.append(True, links[at][order][1:] != links[at][order][:-1])
+    return np.asarray(at[order][first])
+
+
+def _weigh(
+    rows: Rows, linked: Ints, distance: Floats, predicted: Floats, jumped: Bools, size: Ints, some: Ints, tests: Tests
+) -> None:
+    """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
+    tracks, fresh = rows.tracks, rows.fresh[linked]
+    others = np.full(len(linked), -1, dtype=np.int64)
+    others[some] = _newest_other(tracks.link[linked[some]], tracks.updated[linked[some]])
+    together = np.zeros(len(linked), dtype=np.bool_)
+    together[some] = size > 1
+    weighed = fresh & together & ~jumped & (others > tracks.weighed[linked])
+    more = np.where(weighed, np.nan_to_num(tests.agreement(distance), nan=0.0), 0.0)
+    more = np.where(fresh & ~together & ~jumped, tests.bound / 4, more)
+    more = np.where(jumped, tests.jump(predicted), more)
+    tracks.evidence[linked] = np.clip(tracks.evidence[linked] + more, -tests.bound, tests.bound)
+    tracks.weighed[linked] = np.where(weighed, others, tracks.weighed[linked])
+
+
+def _newest_other(links: NDArray[np.uint64], updated: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each row the newest datum of the other rows of its track, -1 without any."""
+    order = np.lexsort((updated, links))
+    last = np.append(links[order][1:] != links[order][:-1], True) if len(order) else np.zeros(0, dtype=np.bool_)
+    begins = np.append(True, last[:-1]) if len(order) else last
+    group = np.cumsum(begins) - 1
+    top = order[last]
+    newest = updated[top][group]
+    second = np.where(begins[last], -1, updated[order][np.flatnonzero(last) - 1])[group]
+    out = np.empty(len(order), dtype=np.int64)
+    out[order] = np.where(last, second, newest)
+    return out
+
+
+def _break(
+    rows: Rows, linked: Ints, links: NDArray[np.uint64], may: Bools, distance: Floats, predicted: Floats,
+    tests: Tests, journal: Journal,
+) -> tuple[Ints, NDArray[np.uint64]]:  # fmt: skip
+    """Break what the sums have decided of the links that may break; of one global track only the row farthest from
+    its prediction."""
+    tracks = rows.tracks
+    ripe = may & (tracks.evidence[linked] <= -tests.bound + 1e-9)
+    shown = np.where(np.isnan(distance), predicted, distance)
+    worst = _worst(links, may, predicted, shown, tracks.since[linked], ripe)
+    if len(worst):
+        journal.broke(rows, linked[worst], links[worst], shown[worst])
+        again = np.isin(links, links[worst])
+        tracks.evidence[linked[again]] = np.maximum(tracks.evidence[linked[again]], 0.0)
+        set_links(tracks, linked[worst], NO_TRACK, -1)
+    return linked[worst], links[worst]

@@ -1,0 +1,57 @@
+"""Why what a source sends is not used, in a sentence for its status, with what mends it."""
+
+from __future__ import annotations
+
+from fusion_service.config import CentreConfig
+from schemas import Message
+
+__all__ = ["ahead", "frame_refused", "frame_waiting", "refusal", "stale", "unfit", "waiting"]
+
+
+def refusal(reason: str, message: Message, last: int, received: int, config: CentreConfig) -> str:
+    """Why a message was refused, where its source can mend it; empty for other reasons. last: newest step, ns."""
+    time = getattr(message, "time", message.epoch)
+    if reason == "late":
+        return (
+            f"its newest refused message is {(last - time) / 1e9:.1f} s older than the step: if its clock is right, "
+            f"set lateness above that (it is {config.lateness:g} s)"
+        )
+    if reason == "future":
+        return (
+            f"its newest refused message, or the start it gives for its run, is "
+            f"{(max(time, message.epoch) - received) / 1e9:.1f} s ahead of this computer's clock: set one of the clocks"
+        )
+    return ""
+
+
+def stale(age: float, limit: float) -> str:
+    """Its tracks were `age` seconds old at the step, and are stale after `limit`."""
+    return (
+        f"its tracks were {age:.1f} s old at the step, and are stale after {limit:.1f} s: if it is only slow, "
+        f"raise lateness, or set stale for it"
+    )
+
+
+def ahead(seconds: float) -> str:
+    """Its newest message is for a later step."""
+    return f"its newest message is for {seconds:.1f} s after the step: its clock is ahead, or delay could be less"
+
+
+def waiting() -> str:
+    """It has not said what it is."""
+    return "its tracks wait a step for its sensor_info"
+
+
+def frame_waiting(spoken: str) -> str:
+    """The sources do not agree yet on a frame, or none of theirs can be that of the picture."""
+    return f"its tracks, in {spoken}, wait for the frame of the picture: set frame under [centre] to say which it is"
+
+
+def frame_refused(why: str) -> str:
+    """Its tracks cannot be brought into the picture's frame."""
+    return f"{why}: let it send ENU or ECEF with what they need, or set frame under [centre] to its own"
+
+
+def unfit(spoken: str, space: tuple[str, ...]) -> str:
+    """What it speaks in cannot be the frame of the picture."""
+    return f"{spoken} cannot be the frame of a picture in {' '.join(space)}"

@@ -1,0 +1,46 @@
+"""What of a source's tracks is stale at a step, and what is told of tracks that are taken but not used."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion_service.centre import notes
+from fusion_service.centre.intervals import Remembered, remember, silence
+from fusion_service.centre.sources import Source, Tracks
+from fusion_service.config import CentreConfig, SourceConfig
+
+__all__ = ["leave_out", "retire"]
+
+
+def retire(source: Source, said: SourceConfig, time: int, room: int, config: CentreConfig) -> Tracks:
+    """The tracks of `source` that are not stale at `time`, ns, which is its table from now on. Of the others at most
+    `room` are remembered."""
+    table, age = source.tracks, time - source.tracks.time
+    limit = silence(table.interval, said, config)
+    source.why = "" if source.why == notes.waiting() else source.why
+    late = age > limit
+    retired = late.any()
+    if retired:
+        source.tracks = table.take(~late)
+    oldest = time - round(config.remember * 1e9)
+    gone = Remembered(table.id[late], table.time[late], table.interval[late])
+    source.remembered = remember(source.remembered, gone, source.tracks.id, oldest, room)
+    new = np.isin(table.id, np.concatenate(source.arrived)) & late if retired and source.arrived else late & False
+    source.leave("stale", int(new.sum()))
+    if source.arrived and new.sum() < sum(len(ids) for ids in source.arrived):
+        source.why = ""
+    elif new.any():
+        newest = int(np.where(new, age, np.iinfo(np.int64).max).argmin())
+        source.why = notes.stale(age[newest] / 1e9, limit[newest] / 1e9)
+    elif source.arrived:
+        source.why = ""
+    elif source.ahead > time and not len(source.tracks.id):
+        source.why = notes.ahead((source.ahead - time) / 1e9)
+    return source.tracks
+
+
+def leave_out(source: Source) -> None:
+    """Its tracks are not used in this step, though they are sound."""
+    if source.arrived and not source.muted:
+        source.leave("waiting", sum(len(ids) for ids in source.arrived))
+        source.why = notes.waiting()

@@ -1,0 +1,59 @@
+"""The registration error that each source states: one shift of all it reports, by its SensorInfo or by the config.
+
+A sensor that is not sure where it stands reports every target shifted by the same unknown amount. Its SensorInfo states
+the covariance of that (`position_covariance`, in its own frame); for a source that states none the config does
+(`registration_sigma`, m, the same in x, y and z), and with `override` the config's is taken for every source.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.sources import Source
+from fusion_service.geodesy import FrameError, transform
+from schemas import Frame
+
+__all__ = ["stated_registration"]
+
+Floats = NDArray[np.float64]
+
+AXES = ("x", "y", "z")
+LARGEST = 1e5
+"""m: no standard deviation is taken for larger."""
+
+
+def stated_registration(intake: Intake, names: tuple[str, ...]) -> Floats | None:
+    """Covariances (n, n, N), m2, in the picture's space and frame, of the shifts of the N sources named; None if
+    nobody states one, or the frame is not known yet."""
+    frame, space = intake.frame, intake.config.space
+    if frame is None:
+        return None
+    shifts = [_shift(intake, intake.sources[name], frame) for name in names]
+    if not any(shift.any() for shift in shifts):
+        return None
+    out = np.zeros((len(space), len(space), len(names)))
+    at = [(space.index(axis), AXES.index(axis)) for axis in AXES if axis in space]
+    for row, a in at:
+        for column, b in at:
+            out[row, column] = [shift[a, b] for shift in shifts]
+    return out
+
+
+def _shift(intake: Intake, source: Source, frame: Frame) -> Floats:
+    """Covariance (3, 3) of a source's shift in `frame`, m2, semidefinite and bounded; a covariance in a frame that
+    has no relation to it is not used."""
+    said, info = intake.declared(source), source.info
+    if said.override or info is None or info.position_covariance is None:
+        return np.asarray(np.eye(3) * min(said.registration_sigma, LARGEST) ** 2)
+    try:
+        covariance = np.asarray(info.position_covariance, dtype=np.float64).reshape(3, 3)
+        _, turned = transform(np.array([info.position]), covariance[None], AXES, info.frame, frame)
+        values, axes = np.linalg.eigh(0.5 * (turned[0] + turned[0].T))
+    except (FrameError, ValueError, np.linalg.LinAlgError):
+        return np.zeros((3, 3))
+    if not np.isfinite(values).all():
+        return np.zeros((3, 3))
+    values = np.clip(values, 0.0, LARGEST**2)
+    return np.asarray(sum(value * np.outer(axis, axis) for value, axis in zip(values, axes.T, strict=True)))

@@ -1,0 +1,67 @@
+"""`fusion-service demo`."""
+
+from __future__ import annotations
+
+import argparse
+import threading
+from pathlib import Path
+
+from fusion_service.process import argument, positive, whole
+
+__all__ = ["EXAMPLE", "HELP", "add", "run"]
+
+HELP = "A whole mission: hub, service, clients and recorder as processes, then a table, a map and a recording."
+EXAMPLE = """fusion-service demo
+  fusion-service demo --rule hmd-ga --json result.json
+  fusion-service demo --scenario autoferry:2 --data DIR --speed 10
+  fusion-service demo --rule bci --set rule_options.max_correlation=0.5 --set gate=0.99"""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
+    parser.add_argument("--scenario", default="three-radars", help="three-radars (default), or autoferry:N")
+    parser.add_argument(
+        "--data", metavar="DIR", help="folder of the Autoferry files, or that holds autoferry/ (default: $FUSION_DATA)"
+    )
+    parser.add_argument("--rule", default="ci", help="fusion rule (default ci; `fusion-service rules` lists them)")
+    parser.add_argument("--criterion", help="of the rule's weights: det or trace")
+    parser.add_argument("--memory", default="restart", choices=("restart", "recursive"), help="default restart")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre, above all others"
+    )
+    parser.add_argument(
+        "--speed", type=argument(positive), default=None, help="times faster than real time (default 10)"
+    )
+    parser.add_argument("--seed", type=argument(whole), default=1, help="of the simulated sensors (default 1)")
+    parser.add_argument(
+        "--tracker",
+        default="ckf",
+        choices=("ckf", "imm", "gm-phd"),
+        help="of the three radars: Gaussians (default), mixtures, or intensities, which an IntensityCentre fuses",
+    )
+    parser.add_argument("--cameras", action="store_true", help="autoferry: the bearing-only cameras too")
+    parser.add_argument(
+        "--out", metavar="DIR", help="folder of the results (default runs/<scenario>-<rule>-<UTC time>)"
+    )
+    parser.add_argument("--json", metavar="FILE", help="write the scores here")
+
+
+def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    """Fly the mission and print its scores. Raises what `run_demo` does."""
+    from fusion_service.demo import run_demo
+
+    run_demo(
+        scenario=args.scenario,
+        rule=args.rule,
+        criterion=args.criterion,
+        memory=args.memory,
+        changes=args.set,
+        data=args.data,
+        speed=args.speed,
+        seed=args.seed,
+        tracker=args.tracker,
+        cameras=args.cameras,
+        out=Path(args.out) if args.out else None,
+        json_path=Path(args.json) if args.json else None,
+        stop=stop,
+    )

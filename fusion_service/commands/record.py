@@ -1,0 +1,119 @@
+"""`fusion-service record`: the recorder."""
+
+from __future__ import annotations
+
+import argparse
+import threading
+from contextlib import ExitStack
+from pathlib import Path
+
+from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.commands.arguments import duration, port, size
+from fusion_service.process import argument
+
+__all__ = ["EXAMPLE", "HELP", "add", "run"]
+
+HELP = "Record everything on the bus."
+EXAMPLE = """fusion-service record --out mission.rrd
+  fusion-service record --out mission/ --rotate-every 1h --keep-for 7d     parts 0001.rrd, 0002.rrd, ...
+  fusion-service record --live       look on with: rerun --connect rerun+http://127.0.0.1:9876/proxy
+  fusion-service record --live-web   look on in a browser"""
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
+    parser.add_argument(
+        "--out",
+        metavar="PATH",
+        help="recording, a new file; or a folder (a name that ends with /, or exists) of parts, which is gone on with "
+        "(default runs/mission-<UTC time>.rrd)",
+    )
+    parser.add_argument(
+        "--connect",
+        action="append",
+        type=argument(check_endpoint),
+        metavar="ENDPOINT",
+        help=f"hub to join (default {DEFAULT_ENDPOINT})",
+    )
+    parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
+    parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
+    parser.add_argument(
+        "--flush",
+        type=argument(duration),
+        default=1.0,
+        metavar="TIME",
+        help="what a kill may cost at most (default 1s)",
+    )
+    parser.add_argument("--no-draw", action="store_true", help="record the messages alone, without the picture")
+    weeks = parser.add_argument_group("for weeks", "any of these makes the recording a folder of parts")
+    for name, kind, metavar, text in (
+        ("--rotate-size", size, "SIZE", "of a part (default 500MB)"),
+        ("--rotate-every", duration, "TIME", "time of a part, as in 1h"),
+        ("--keep-size", size, "SIZE", "delete the oldest parts beyond 20GB, say"),
+        ("--keep-for", duration, "TIME", "delete parts older than 7d, say"),
+    ):
+        weeks.add_argument(name, type=argument(kind), metavar=metavar, help=text)
+    live = parser.add_argument_group("live")
+    live.add_argument(
+        "--live",
+        nargs="?",
+        const="127.0.0.1:9876",
+        type=argument(_address),
+        metavar="HOST:PORT",
+        help="serve the picture to open viewers (default 127.0.0.1:9876; any other host opens it to the network)",
+    )
+    live.add_argument(
+        "--live-web",
+        nargs="?",
+        const=9090,
+        type=argument(port),
+        metavar="PORT",
+        help="and the viewer as a page, on the host of --live (default port 9090)",
+    )
+
+
+def _address(text: str) -> tuple[str, int]:
+    from fusion_service.recording.live import address
+
+    return address(text)
+
+
+def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    """Record until `stop` is set. Raises `UsageError`, `BusError`, `ReviewError`, ImportError, OSError."""
+    from fusion_service.bus import open_bus
+    from fusion_service.errors import UsageError
+    from fusion_service.recording import Rotation, default_path, run_recorder
+    from fusion_service.recording.live import DEFAULT_ADDRESS, Live
+    from fusion_service.recording.parts import is_folder
+
+    limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
+    rotation = None
+    if any(limit is not None for limit in limits) or (args.out and is_folder(args.out)):
+        try:
+            rotation = Rotation(*limits)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+    path = Path(args.out) if args.out else default_path(suffix=".rrd" if rotation is None else "")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and (rotation is None or path.is_file()):
+        raise FileExistsError(f"{path} exists already: name another file, or move it away")
+    if (args.live or args.live_web) and args.no_draw:
+        raise UsageError("--live shows what is drawn: leave out --no-draw")
+    with ExitStack() as stack:
+        live = None
+        if args.live or args.live_web:
+            live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
+            stack.callback(live.close)
+            print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
+        bus = stack.enter_context(open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop))
+        run_recorder(
+            bus,
+            path,
+            realm=args.realm,
+            stop=stop,
+            cutoff=args.cutoff,
+            draw=not args.no_draw,
+            rotation=rotation,
+            live=live,
+            interval=args.flush,
+        )

@@ -1,0 +1,47 @@
+"""`fusion-service run`: the service."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import threading
+
+from fusion_service.bus.endpoint import check_endpoint
+from fusion_service.process import argument
+
+__all__ = ["EXAMPLE", "HELP", "add", "run"]
+
+HELP = "The fusion service."
+EXAMPLE = "fusion-service run --config centre.toml"
+
+
+def add(parser: argparse.ArgumentParser) -> None:
+    """The arguments."""
+    parser.add_argument("--config", metavar="FILE", help="TOML file (default: all defaults; `check` shows them)")
+    parser.add_argument(
+        "--connect",
+        action="append",
+        type=argument(check_endpoint),
+        metavar="ENDPOINT",
+        help="hub to join, instead of the config's",
+    )
+    parser.add_argument("--hub", action="store_true", help="hold a hub in this process too (the smallest installation)")
+
+
+def run(args: argparse.Namespace, stop: threading.Event) -> None:
+    """Run the service until `stop` is set. Raises `ConfigError`, `BusError`, `StateError`."""
+    from fusion_service.bus import open_bus
+    from fusion_service.config import ServiceConfig, load_config
+
+    if stop.is_set():  # what follows is slow to load
+        return
+    from fusion_service.service.daemon import run_service
+
+    config = load_config(args.config) if args.config else ServiceConfig()
+    if args.connect:
+        config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, connect=tuple(args.connect)))
+    if args.hub:
+        with open_bus(listen=config.bus.connect, mode="router"):
+            run_service(config, stop)
+    else:
+        run_service(config, stop)

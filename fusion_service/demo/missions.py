@@ -1,0 +1,81 @@
+"""The missions that the demo knows: their clients' commands, the settings of the centre, how they are scored."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import dataclass
+from typing import Any
+
+from fusion_service.errors import DataError, UsageError
+from fusion_service.process import data_folder
+
+__all__ = ["AUTOFERRY", "THREE_RADARS", "MissionPlan", "plan_mission"]
+
+JITTER = 1.5
+"""Seconds that the machine may hold a client up, and it is still waited for."""
+
+THREE_RADARS = """\
+period = 10.0
+frame = {kind = "enu", lat = 59.7138694, lon = -55.2676093}   # collocated with radar 1 (Sharma 6.4)
+motion = {kind = "cv", q = 10.0}
+coast = 25.0
+"""
+"""Settings of the centre for the simulated radars, as TOML."""
+
+AUTOFERRY = """\
+period = 1.0
+frame = {kind = "enu", lat = 63.4389029083, lon = 10.39908278, alt = 39.923}   # Piren
+motion = {kind = "cv", q = 0.1}
+coast = 3.0
+"""
+"""Settings of the centre for the recorded lidar and radar, as TOML."""
+
+
+@dataclass(frozen=True)
+class MissionPlan:
+    """A mission as the demo flies it. clients: the command of each; centre: its settings, TOML; seconds: how long;
+    speed: times real time, unless another is asked for; cutoff, m, every, s: of the scores (None: each step)."""
+
+    name: str
+    clients: dict[str, list[str]]
+    centre: str
+    seconds: float
+    speed: float
+    cutoff: float
+    every: float | None
+    lateness: float
+
+    def settings(self, speed: float) -> dict[str, Any]:
+        """The centre's settings at so many times real time."""
+        return {"lateness": max(self.lateness, JITTER * speed), **tomllib.loads(self.centre)}
+
+
+def plan_mission(
+    scenario: str, *, data: str | None = None, seed: int = 1, tracker: str = "ckf", cameras: bool = False
+) -> MissionPlan:
+    """The plan of `three-radars` (with `seed` and `tracker`) or of `autoferry:N` (from `data`, or $FUSION_DATA).
+
+    Raises `UsageError` for any other, for options that do not go with it and where no data are named; `DataError` where
+    they are not there.
+    """
+    if scenario == "three-radars":
+        if cameras:
+            raise UsageError("--cameras goes with --scenario autoferry:N")
+        command = ["simulate", "three-radars", "--tracker", tracker, "--seed", str(seed), "--sensor"]
+        sensors = ("radar1", "radar2", "radar3", "truth")
+        return MissionPlan(
+            scenario, {name: [*command, name] for name in sensors}, THREE_RADARS, 300.0, 10.0, 5000.0, None, 15.0
+        )
+    if tracker != "ckf":
+        raise UsageError("--tracker goes with --scenario three-radars")
+    kind, _, number = scenario.partition(":")
+    if kind != "autoferry" or not number.isdigit():
+        raise UsageError(f"unknown scenario {scenario!r}: use three-radars, or autoferry:N with N one of 2 3 5 13 16")
+    folder = data_folder("autoferry", data)
+    if folder is None:
+        raise UsageError("autoferry needs its recordings: give their folder with --data or in FUSION_DATA")
+    if not (folder / f"scenario{number}_detections.json").is_file():
+        raise DataError(f"no scenario{number}_detections.json in {folder}: --data names the Autoferry folder")
+    command = ["playback", scenario, "--data", str(folder), "--sensor"]
+    clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
+    return MissionPlan(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)

@@ -1,0 +1,68 @@
+"""What a centre's pictures and step logs say of its work."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from schemas import GlobalTracks, Status, StepLog
+from schemas.messages import BROKEN, CONFIRMED, GATE_FAILED, KEPT
+
+__all__ = ["Account"]
+
+
+@dataclass(slots=True, eq=False)
+class Account:
+    """What a centre's pictures and step logs say of its work.
+
+    rules: those it named. shown: pictures' confirmed tracks by number of their sources. ended: reason -> tracks.
+    refused, dropped: (source, reason, "messages" or "tracks") -> how many. kept, failed, broken: source -> links that
+    agreed, did not, were cut; innovation: source -> (n, sum of d2) of a link against the fusion of the other sources.
+    dimension: of that d2, 0 without pictures. status: the newest, None without.
+    """
+
+    rules: Counter[str] = field(default_factory=Counter)
+    shown: Counter[int] = field(default_factory=Counter)
+    pictures: int = 0
+    steps: int = 0
+    runs: set[int] = field(default_factory=set)
+    dimension: int = 0
+    ended: Counter[str] = field(default_factory=Counter)
+    refused: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    dropped: Counter[tuple[str, str, str]] = field(default_factory=Counter)
+    kept: Counter[str] = field(default_factory=Counter)
+    failed: Counter[str] = field(default_factory=Counter)
+    broken: Counter[str] = field(default_factory=Counter)
+    innovation: dict[str, tuple[int, float]] = field(default_factory=dict)
+    status: Status | None = None
+
+    def picture(self, message: GlobalTracks) -> None:
+        """Enter a picture."""
+        self.rules[message.rule] += 1
+        self.pictures += 1
+        self.dimension = len(message.space)
+        self.runs.add(message.epoch)
+        self.shown.update(message.contributor_counts[message.status == CONFIRMED].tolist())
+        self.ended.update(reason for _, reason, _ in message.ended)
+
+    def log(self, message: StepLog) -> None:
+        """Enter a step log."""
+        self.steps += 1
+        self.runs.add(message.epoch)
+        for counter, entries in ((self.refused, message.refused), (self.dropped, message.dropped)):
+            for entry in entries:
+                what = "tracks" if entry.count else "messages"
+                counter[entry.source, entry.reason, what] += entry.count or 1
+        made = message.decisions
+        for index, source in enumerate(message.sources):
+            mine = made.source == index
+            kinds = np.bincount(made.kind[mine], minlength=GATE_FAILED + 1)
+            self.kept[source] += int(kinds[KEPT])
+            self.failed[source] += int(kinds[GATE_FAILED])
+            self.broken[source] += int(kinds[BROKEN])
+            value = made.value[mine & ((made.kind == KEPT) | (made.kind == GATE_FAILED))]
+            value = value[np.isfinite(value)]
+            n, total = self.innovation.get(source, (0, 0.0))
+            self.innovation[source] = n + len(value), total + float(value.sum())

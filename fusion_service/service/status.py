@@ -1,0 +1,81 @@
+"""What the process counts of itself, and the status that it publishes of it."""
+
+from __future__ import annotations
+
+import resource
+import time
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any
+
+from fusion_service.bus import Inbox
+from schemas import Status
+
+__all__ = ["StatusMaker"]
+
+
+class StatusMaker:
+    """counts: messages, bytes, steps, missed, failed_steps, unsaved, behind; whoever sees one counts it."""
+
+    def __init__(self, name: str) -> None:
+        self.counts: Counter[str] = Counter()
+        self._name = name
+        self._number = 0
+        self._before: Counter[str] = Counter()
+        self._before_at = 0.0
+        self._started = time.monotonic()
+        self._seconds = {"last": 0.0, "max": 0.0, "total": 0.0}
+
+    def stepped(self, seconds: float) -> None:
+        """A step was made, in so many seconds."""
+        self.counts["steps"] += 1
+        self._seconds["last"] = seconds
+        self._seconds["max"] = max(self._seconds["max"], seconds)
+        self._seconds["total"] += seconds
+
+    def make(
+        self,
+        last: Status | None,
+        *,
+        epoch: int,
+        inbox: Inbox[Any],
+        refused: dict[str, int],
+        alive: Mapping[str, bool],
+        skipped: int,
+    ) -> Status:
+        """The status now. last: the centre's own, of its newest step; refused: by reason; alive: whether each source is
+        there; skipped: steps that were slept through."""
+        uptime = time.monotonic() - self._started
+        counts, now = self.counts, time.time_ns()
+        recent, span = counts - self._before, max(uptime - self._before_at, 1e-3)
+        self._before, self._before_at = Counter(counts), uptime
+        sources: dict[str, dict[str, Any]] = dict(last.sources) if last is not None else {}
+        for name, there in alive.items():
+            sources[name] = {**sources.get(name, {}), "alive": there}
+        queue = {"waiting": len(inbox), "capacity": inbox.capacity, "high_water": inbox.high_water}
+        number, self._number = self._number, self._number + 1
+        return Status(
+            source=self._name,
+            epoch=epoch,
+            seq=number,
+            sent=now,
+            time=last.time if last is not None else now,
+            step=last.step if last is not None else 0,
+            uptime=uptime,
+            rates={name: recent[name] / span for name in ("messages", "bytes", "steps")},
+            queue={**queue, **(last.queue if last is not None else {}), "missed": counts["missed"]},
+            refused=refused,
+            dropped=last.dropped if last is not None else {},
+            sources=sources,
+            tracks=last.tracks if last is not None else {},
+            step_time={
+                "last": self._seconds["last"],
+                "max": self._seconds["max"],
+                "mean": self._seconds["total"] / max(counts["steps"], 1),
+                "failed": float(counts["failed_steps"]),
+                "unsaved": float(counts["unsaved"]),
+                "skipped": float(skipped),
+                "behind": float(counts["behind"]),
+            },
+            memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+        )

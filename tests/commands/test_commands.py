@@ -1,0 +1,80 @@
+"""What holds of every command: one file each, help with an example, and nothing loaded that it does not need."""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+from fusion_service import commands
+from fusion_service.cli import main
+from fusion_service.commands import COMMANDS, arguments
+from fusion_service.process import argument, data_folder, positive, whole
+
+FILES = {path.stem for path in Path(commands.__path__[0]).glob("*.py")} - {"__init__", "arguments"}
+
+
+def test_every_file_is_a_command() -> None:
+    assert set(COMMANDS) == FILES
+
+
+@pytest.mark.parametrize(("name", "module"), COMMANDS.items(), ids=COMMANDS)
+def test_a_command_has_help_and_an_example(name: str, module: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+    assert set(module.__all__) == {"EXAMPLE", "HELP", "add", "run"}
+    assert module.EXAMPLE.startswith(f"fusion-service {name}")
+    with pytest.raises(SystemExit) as ended:
+        main([name, "--help"])
+    assert ended.value.code == 0
+    assert f"Example:\n  {module.EXAMPLE}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("command", "light"),
+    [
+        (["--help"], {"numpy", "zenoh", "rerun", "scipy", "msgpack"}),
+        (["rules"], {"zenoh", "rerun", "fusion_service.demo", "fusion_service.config", "fusion_service.service"}),
+        (["check"], {"zenoh", "rerun", "fusion_service.demo", "fusion_service.service"}),
+    ],
+)
+def test_a_command_loads_only_what_it_needs(command: list[str], light: set[str]) -> None:
+    code = (
+        "import sys\nfrom fusion_service.cli import main\ntry:\n  main(sys.argv[1:])\nexcept SystemExit:\n  pass\n"
+        "print('loaded', *sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=True)
+    assert set(done.stdout.rpartition("loaded ")[2].split()) & light == set()
+
+
+@pytest.mark.parametrize(
+    ("read", "good", "bad"),
+    [
+        (positive, {"0.5": 0.5, "1e3": 1000.0}, ["0", "-1", "nan", "inf", "x", ""]),
+        (whole, {"0": 0, "17": 17}, ["-1", "1.0", "x", "", "9" * 19, "²"]),
+        (arguments.port, {"1": 1, "65535": 65535}, ["0", "65536", "-1", "x", ""]),
+    ],
+)
+def test_values_of_options(read: object, good: dict[str, object], bad: list[str]) -> None:
+    assert callable(read)
+    for text, value in good.items():
+        assert argument(read)(text) == value
+    for text in bad:
+        with pytest.raises(argparse.ArgumentTypeError, match="is not a"):
+            argument(read)(text)
+
+
+def test_data_are_in_the_folder_or_in_one_of_their_name_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("FUSION_DATA", raising=False)
+    assert data_folder("autoferry") is None
+    assert data_folder("autoferry", "") is None
+    assert data_folder("autoferry", tmp_path) == tmp_path
+    (tmp_path / "autoferry").mkdir()
+    assert data_folder("autoferry", str(tmp_path)) == tmp_path / "autoferry"
+    assert data_folder("autoferry", tmp_path / "autoferry") == tmp_path / "autoferry"
+    monkeypatch.setenv("FUSION_DATA", str(tmp_path))
+    assert data_folder("autoferry") == tmp_path / "autoferry"
+    assert data_folder("other") == tmp_path
+    assert data_folder("other", "given") == Path("given")
