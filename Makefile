@@ -2,10 +2,10 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-export PIP_CONSTRAINT := constraints.txt
+export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint bench studies clean
+.PHONY: demo test lint format docs wheel-test python-test bench studies clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/ready
@@ -18,6 +18,21 @@ lint: $(VENV)/ready
 	$(BIN)/ruff check -q .
 	$(BIN)/ruff format -q --check .
 	$(BIN)/mypy
+
+format: $(VENV)/ready
+	$(BIN)/ruff check -q --fix .
+	$(BIN)/ruff format -q .
+
+docs: $(VENV)/docs-ready
+	$(BIN)/python docs/site/build.py
+	@echo "site/html/index.html"
+
+wheel-test: $(VENV)/ready
+	$(BIN)/python tests/wheel.py
+
+# The quick tests under another Python: make python-test OTHER=python3.13
+python-test:
+	$(PYTHON) tests/other_python.py $(OTHER)
 
 bench: $(VENV)/ready
 	for name in codec bus rules mixtures centre; do OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m benchmarks.$$name || exit 1; done
@@ -32,5 +47,9 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	$(BIN)/pip install -q -e '.[record,report,dev]'
 	touch $@
 
+$(VENV)/docs-ready: $(VENV)/ready
+	$(BIN)/pip install -q -e '.[docs]'
+	touch $@
+
 clean:
-	rm -rf $(VENV) runs
+	rm -rf $(VENV) runs site dist

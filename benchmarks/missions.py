@@ -1,4 +1,4 @@
-"""The tables of the README: whole missions by `fusion-service demo`, one after the other.
+"""The tables of docs/measurements.md: whole missions by `fusion-service demo`, one after the other.
 
 python -m benchmarks.missions                      three radars under each rule
 python -m benchmarks.missions --data DIR           Autoferry 2, 3, 5, 13, 16 as well, without and with cameras

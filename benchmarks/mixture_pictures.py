@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.densities import Mixture
 from fusion_service.existence import fuse_existence
 from fusion_service.rules import fuse_mixtures
 
-Array = NDArray[np.float64]
 A, B = np.array([[2.5, -1.0], [-1.0, 1.2]]), np.array([[0.8, -0.5], [-0.5, 4.0]])
 P1 = Mixture([0.3, 0.7], [[-0.5, 3.0], [2.0, 0.3]], [A, B])
 P2 = Mixture([0.4, 0.6], [[-1.5, 1.0], [3.0, -4.0]], [A, B])
@@ -41,20 +40,20 @@ CASES: tuple[tuple[str, str, dict[str, Any], str | None], ...] = (
 )
 
 
-def exact() -> dict[str, Array]:
+def exact() -> dict[str, Floats]:
     f, g = P1.pdf(GRID), P2.pdf(GRID)
     out = {"aa": 0.5 * (f + g), "ga": np.sqrt(f * g), "hmd": 2.0 * f * g / (f + g)}
     return {name: density / (density.sum() * CELL) for name, density in out.items()}
 
 
-def levels(density: Array) -> Array:
+def levels(density: Floats) -> Floats:
     """Heights whose regions hold 90, 60 and 30 % of the mass."""
     ordered = np.sort(density.ravel())[::-1]
     held = np.cumsum(ordered) * CELL
     return np.array([ordered[np.searchsorted(held, share)] for share in (0.9, 0.6, 0.3)])
 
 
-def contours(axes: Axes, density: Array, colour: str, style: str = "solid") -> None:
+def contours(axes: Axes, density: Floats, colour: str, style: str = "solid") -> None:
     axes.contour(AXIS, AXIS, density.T, levels=levels(density), colors=colour, linestyles=style, linewidths=1.0)
 
 
@@ -99,9 +98,9 @@ def cross_terms(folder: Path) -> None:
     x = np.linspace(-40.0, 150.0, 3801)[:, None]
     step = float(x[1, 0] - x[0, 0])
     f, g = GM1.pdf(x), GM2.pdf(x)
+    cases: tuple[tuple[str, dict[str, Any]], ...] = (("gm-ga", {}), ("gm-ga", {"cross_terms": "sampled"}), ("aa", {}))
     published, sampled, union = (
-        fuse_mixtures(rule, [GM1, GM2], normalise=False, weights="uniform", **options)
-        for rule, options in (("gm-ga", {}), ("gm-ga", {"cross_terms": "sampled"}), ("aa", {}))
+        fuse_mixtures(rule, [GM1, GM2], normalise=False, weights="uniform", **options) for rule, options in cases
     )
     true = np.sqrt(f * g)
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")

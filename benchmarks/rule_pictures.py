@@ -10,11 +10,9 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib import pyplot as plt
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import fuse
-
-Array = NDArray[np.float64]
 
 MEANS = np.array([[0.5, 1.0], [2.0, 1.0]])
 COVARIANCES = np.array([[[2.5, -1.0], [-1.0, 1.2]], [[0.8, -0.5], [-0.5, 4.0]]])
@@ -41,7 +39,7 @@ CASES: tuple[tuple[str, dict[str, Any]], ...] = (
 TRUE, REPORTED, SOURCES = "#c0392b", "#1f6fb2", ("#7f8c8d", "#b8a06a")
 
 
-def ellipse(mean: Array, P: Array) -> Array:
+def ellipse(mean: Floats, P: Floats) -> Floats:
     angle = np.linspace(0.0, 2.0 * np.pi, 200)
     return np.asarray(mean[:, None] + 2.0 * np.linalg.cholesky(P) @ np.stack([np.cos(angle), np.sin(angle)]))
 

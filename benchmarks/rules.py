@@ -21,12 +21,11 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import fuse
 
-Array = NDArray[np.float64]
 Case = tuple[str, dict[str, Any]]
 
 CASES: tuple[Case, ...] = (
@@ -57,21 +56,21 @@ GOALS = {
 """At n = 4, N = 2, B = 10,000."""
 
 
-def estimates(rng: np.random.Generator, B: int, N: int, n: int) -> tuple[Array, Array]:
+def estimates(rng: np.random.Generator, B: int, N: int, n: int) -> tuple[Floats, Floats]:
     """Random estimates: standard deviations over two decades, means a few of them apart."""
     q, _ = np.linalg.qr(rng.normal(size=(B, N, n, n)))
     P = (q * 10.0 ** rng.uniform(-1, 1, size=(B, N, 1, n))) @ q.swapaxes(-1, -2)
     return rng.normal(size=(B, N, n)), 0.5 * (P + P.swapaxes(-1, -2))
 
 
-def stacked(x: Array, P: Array) -> tuple[Array, Array]:
+def stacked(x: Floats, P: Floats) -> tuple[Floats, Floats]:
     """Yardstick (a)."""
     A = np.linalg.inv(P)
     fused = np.linalg.inv(A.sum(axis=1))
     return (fused @ (A @ x[..., None]).sum(axis=1))[..., 0], fused
 
 
-def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
+def one_by_one(x: Floats, P: Floats, rule: str, options: dict[str, Any]) -> None:
     """Yardstick (b): what a script would do."""
     _, N, _ = x.shape
     criterion, rho = options["criterion"], options.get("max_correlation", 1.0)
@@ -84,7 +83,7 @@ def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
 
         dets = np.linalg.slogdet(covariances)[1]
 
-        def information(w: Array) -> Array:
+        def information(w: Floats) -> Floats:
             if rule == "ici":
                 return np.asarray(A.sum(axis=0) - np.linalg.inv(np.einsum("i,ijk->jk", w, covariances)))  # noqa: B023
             if rule == "aa":
@@ -95,7 +94,7 @@ def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
                 return np.asarray(np.einsum("i,ijk->jk", w, C) + (r.T * w) @ r)  # noqa: B023
             return np.asarray(np.einsum("i,ijk->jk", w / ((1 - rho) * w + rho), A))  # noqa: B023
 
-        def cost(w: Array) -> float:
+        def cost(w: Floats) -> float:
             M = information(w)
             if rule == "aa":
                 return float(w @ dets - np.linalg.slogdet(M)[1])  # noqa: B023
@@ -113,7 +112,7 @@ def one_by_one(x: Array, P: Array, rule: str, options: dict[str, Any]) -> None:
             )
 
 
-def chernoff() -> Callable[[Array, Array], None] | None:
+def chernoff() -> Callable[[Floats, Floats], None] | None:
     """Yardstick (c), for pairs; None without Stone Soup."""
     try:
         from stonesoup.models.measurement.linear import LinearGaussian
@@ -124,7 +123,7 @@ def chernoff() -> Callable[[Array, Array], None] | None:
     except ImportError:
         return None
 
-    def loop(x: Array, P: Array) -> None:
+    def loop(x: Floats, P: Floats) -> None:
         n = x.shape[-1]
         model = LinearGaussian(ndim_state=n, mapping=list(range(n)), noise_covar=np.zeros((n, n)))
         updater = ChernoffUpdater(measurement_model=model)
@@ -143,7 +142,7 @@ def clock(run: Callable[[], object]) -> float:
 
 
 def measure(
-    x: Array, P: Array, rounds: int, third: Callable[[Array, Array], None] | None
+    x: Floats, P: Floats, rounds: int, third: Callable[[Floats, Floats], None] | None
 ) -> Iterator[tuple[str, float, float, float, float]]:
     """For each case: its name, seconds per batch, ratio to (a), speed-up over (b) and (c) (NaN: not there)."""
     B, N, _ = x.shape

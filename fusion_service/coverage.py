@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Bools, Floats
 from fusion_service.geodesy import FrameError, transform
 from schemas import Disk, Frame, Sector, SensorInfo
 
 __all__ = ["covers"]
 
-Floats = NDArray[np.float64]
 
-
-def covers(info: SensorInfo, positions: Floats, frame: Frame) -> NDArray[np.bool_]:
+def covers(info: SensorInfo, positions: Floats, frame: Frame) -> Bools:
     """Whether each place, positions (2 or 3, M) in `frame`, m, is covered: (M,).
 
     Nothing is covered by a sensor that states no coverage, or whose frame cannot be reached from `frame`.
@@ -38,7 +36,7 @@ def covers(info: SensorInfo, positions: Floats, frame: Frame) -> NDArray[np.bool
     return _in_polygon(info.coverage.points, x, y)
 
 
-def _in_polygon(points: tuple[tuple[float, float], ...], x: Floats, y: Floats) -> NDArray[np.bool_]:
+def _in_polygon(points: tuple[tuple[float, float], ...], x: Floats, y: Floats) -> Bools:
     """Even-odd rule: an odd number of edges lies to the right of the place."""
     inside = np.zeros(len(x), dtype=np.bool_)
     for (x1, y1), (x2, y2) in zip(points, (*points[1:], points[0]), strict=True):

@@ -20,12 +20,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fusion_service import linalg
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.densities import chernoff_discrete
 from fusion_service.errors import FusionError
-from fusion_service.linalg import FloatArray
 
 __all__ = [
     "ExistenceError",
@@ -51,7 +51,7 @@ class ExistenceError(FusionError, ValueError):
 
 def fuse_existence(
     r: ArrayLike, method: str = "consistent", *, weights: ArrayLike | None = None, overlap: ArrayLike | None = None
-) -> FloatArray:
+) -> Floats:
     """Existence probability (...) from those of N sources, r (..., N).
 
     "consistent" (Uney (50), (51)) for smallest a and largest b: with u = ln((1-a)/(1-b)) and v = ln(b/a) it is
@@ -60,6 +60,9 @@ def fuse_existence(
 
     "average": sum w_i r_i. "geometric" (Uney (21)): prod r_i^w_i z / (prod (1-r_i)^w_i + prod r_i^w_i z) with
     z = `overlap` (...), which it needs. `weights` (..., N), uniform if not given.
+
+    Raises ExistenceError for what is no probability or weight, an unknown method, and under "geometric" for sources
+    that are certain of the contrary.
     """
     p = _array("existence", r, 1, 1.0)
     if _check(method, weights, overlap) == "consistent":
@@ -82,11 +85,13 @@ def fuse_existence(
 
 def fuse_poisson(
     rates: ArrayLike, method: str = "consistent", *, weights: ArrayLike | None = None, overlap: ArrayLike | None = None
-) -> FloatArray:
+) -> Floats:
     """Expected number (...) from those of N Poisson sources, rates (..., N), not negative.
 
     "consistent" (Uney (52), (53), corrected): the logarithmic mean (b - a) / ln(b/a) of the smallest and the largest.
     "geometric" (Uney (30), with the z it lacks): prod lambda_i^w_i z.
+
+    Raises ExistenceError for what is no rate or weight.
     """
     x = _array("rates", rates, 1, np.inf)
     if _check(method, weights, overlap) == "consistent":
@@ -103,7 +108,7 @@ def fuse_poisson(
 
 def fuse_cardinality(
     pmfs: ArrayLike, method: str = "consistent", *, weights: ArrayLike | None = None, overlap: ArrayLike | None = None
-) -> tuple[FloatArray, FloatArray]:
+) -> tuple[Floats, Floats]:
     """Cardinality distribution p (..., K) and weights w (..., N) from pmfs (..., N, K) over 0 ... K-1 targets.
 
     "consistent" (Uney (37), Algorithm 2 corrected): p ~ prod p_i^w_i with the Chernoff weights. "geometric": the same
@@ -138,50 +143,61 @@ def fuse_cardinality(
     return _softmax(base + _power(logs.swapaxes(-1, -2), w[..., None, :])), w
 
 
-def cardinality_map(p: ArrayLike) -> NDArray[np.intp]:
-    """Most probable number (...) of p (..., K); the smallest of equals."""
+def cardinality_map(p: ArrayLike) -> Ints:
+    """Most probable number (...) of p (..., K); the smallest of equals. Raises ExistenceError for no probabilities."""
     return np.asarray(_array("pmf", p, 1, 1.0).argmax(axis=-1))
 
 
-def cardinality_mean(p: ArrayLike) -> FloatArray:
-    """Expected number (...) of p (..., K)."""
+def cardinality_mean(p: ArrayLike) -> Floats:
+    """Expected number (...) of p (..., K). Raises ExistenceError for what are no probabilities."""
     a = _array("pmf", p, 1, 1.0)
     return _sum(a * np.arange(a.shape[-1]))
 
 
-def lower_existence(r: ArrayLike, p: ArrayLike) -> FloatArray:
-    """Existence (...) after a scan without a report where the detection probability is p: r (1-p) / (1 - r p)."""
+def lower_existence(r: ArrayLike, p: ArrayLike) -> Floats:
+    """Existence (...) after a scan without a report where the detection probability is p: r (1-p) / (1 - r p).
+
+    Raises ExistenceError for what are no probabilities.
+    """
     a, b = _array("existence", r, 0, 1.0), _array("detection probability", p, 0, 1.0)
     with np.errstate(invalid="ignore"):
         return np.asarray(np.where(a * b < 1.0, a * (1.0 - b) / (1.0 - a * b), 0.0))
 
 
-def loses_existence(r: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.bool_]:
-    """Where (...) the exponential mixture of r (..., N) believes less in the target than every source (Uney (17))."""
+def loses_existence(r: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> Bools:
+    """Where (...) the exponential mixture of r (..., N) believes less in the target than every source (Uney (17)).
+
+    Raises ExistenceError as `fuse_existence`.
+    """
     fused = fuse_existence(r, "geometric", weights=weights, overlap=overlap)
     return _below(fused, _array("existence", r, 1, 1.0).min(axis=-1))
 
 
-def loses_rate(rates: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.bool_]:
+def loses_rate(rates: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> Bools:
     """Where (...) the exponential mixture of Poissons expects fewer than every source (Uney (31)).
 
-    Uney's (32), z < min / max of the rates, is sufficient for that but not necessary.
+    Uney's (32), z < min / max of the rates, is sufficient for that but not necessary. Raises ExistenceError as
+    `fuse_poisson`.
     """
     fused = fuse_poisson(rates, "geometric", weights=weights, overlap=overlap)
     return _below(fused, _array("rates", rates, 1, np.inf).min(axis=-1))
 
 
-def loses_cardinality(pmfs: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> NDArray[np.bool_]:
-    """For which numbers (..., K) the exponential mixture of IID clusters is below every source (Uney (17), (33))."""
+def loses_cardinality(pmfs: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> Bools:
+    """For which numbers (..., K) the exponential mixture of IID clusters is below every source (Uney (17), (33)).
+
+    Raises ExistenceError as `fuse_cardinality`.
+    """
     fused, _ = fuse_cardinality(pmfs, "geometric", weights=weights, overlap=overlap)
     return _below(fused, _array("pmfs", pmfs, 2, 1.0).min(axis=-2))
 
 
-def loss_bound(pmfs: ArrayLike, scales: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
+def loss_bound(pmfs: ArrayLike, scales: ArrayLike, weights: ArrayLike | None = None) -> Floats:
     """The scale (..., K) that z(n) must stay below for number n to be lost, with the other scales as they are.
 
     pmfs (..., N, K), scales (..., K) the z(n) of Uney (14), z(0) = 1: Uney (18). For IID clusters scales = z^n, and
     the n-th root is then compared with z as in (33). Infinite where the weighted geometric mean is not above the least.
+    Raises ExistenceError for what are no probabilities or weights.
     """
     p, z = _array("pmfs", pmfs, 2, 1.0), _array("scales", scales, 1, 1.0)
     w = _weights(weights, p.shape[:-1])
@@ -193,11 +209,12 @@ def loss_bound(pmfs: ArrayLike, scales: ArrayLike, weights: ArrayLike | None = N
     return np.asarray(np.where(np.isnan(bound), np.inf, bound))
 
 
-def loss_threshold(pmfs: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> FloatArray:
+def loss_threshold(pmfs: ArrayLike, overlap: ArrayLike, weights: ArrayLike | None = None) -> Floats:
     """The number of targets (...) above which every number is lost by IID clusters (Uney (34)).
 
     ln(N gamma) / ln z with N = sum prod p_i^w_i z^n and gamma = min_n min_i p_i / prod p_i^w_i, of numbers that all
     sources allow. Infinite for z = 1: nothing need be lost.
+    Raises ExistenceError for what are no probabilities or weights.
     """
     p, z = _array("pmfs", pmfs, 2, 1.0), _array("overlap", overlap, 0, 1.0)
     w = _weights(weights, p.shape[:-1])
@@ -208,7 +225,7 @@ def loss_threshold(pmfs: ArrayLike, overlap: ArrayLike, weights: ArrayLike | Non
         return np.asarray(np.where(z < 1.0, np.log(norm * gamma) / np.log(z), np.inf))
 
 
-def _array(name: str, value: Any, axes: int, most: float) -> FloatArray:
+def _array(name: str, value: Any, axes: int, most: float) -> Floats:
     try:
         out = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -230,7 +247,7 @@ def _check(method: str, weights: ArrayLike | None, overlap: ArrayLike | None) ->
     return method
 
 
-def _weights(weights: ArrayLike | None, shape: tuple[int, ...]) -> FloatArray:
+def _weights(weights: ArrayLike | None, shape: tuple[int, ...]) -> Floats:
     if weights is None:
         return np.full(shape, 1.0 / shape[-1])
     w = _array("weights", weights, 1, 1.0)
@@ -243,32 +260,32 @@ def _weights(weights: ArrayLike | None, shape: tuple[int, ...]) -> FloatArray:
     return w
 
 
-def _sum(a: FloatArray) -> FloatArray:
+def _sum(a: Floats) -> Floats:
     """Over the last axis, in its order."""
     return linalg.total(np.moveaxis(a, -1, 0))
 
 
-def _power(logs: FloatArray, w: FloatArray) -> FloatArray:
+def _power(logs: Floats, w: Floats) -> Floats:
     """sum_i w_i logs_i over the last axis, where a weight of 0 counts for nothing."""
     with np.errstate(invalid="ignore"):
         return _sum(np.where(w > 0.0, w * logs, 0.0))
 
 
-def _log_ratio(b: FloatArray, a: FloatArray, difference: FloatArray | None = None) -> FloatArray:
+def _log_ratio(b: Floats, a: Floats, difference: Floats | None = None) -> Floats:
     """ln(b / a) for b >= a, to full precision where they are close."""
     d = b - a if difference is None else difference
     return np.asarray(np.where(b > 2.0 * a, np.log(b) - np.log(a), np.log1p(d / a)))
 
 
-def _below(value: FloatArray, least: FloatArray) -> NDArray[np.bool_]:
+def _below(value: Floats, least: Floats) -> Bools:
     """By more than rounding."""
     return np.asarray(value < least * (1.0 - 1e-12))
 
 
-def _clip_between(value: FloatArray, of: FloatArray) -> FloatArray:
+def _clip_between(value: Floats, of: Floats) -> Floats:
     return np.asarray(np.clip(value, of.min(axis=-1), of.max(axis=-1)))
 
 
-def _softmax(logs: FloatArray) -> FloatArray:
+def _softmax(logs: Floats) -> Floats:
     e = np.exp(logs - logs.max(axis=-1, keepdims=True))
     return np.asarray(e / _sum(e)[..., None])

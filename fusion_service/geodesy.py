@@ -13,8 +13,9 @@ import math
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from fusion_service.arrays import Floats
 from fusion_service.errors import FusionError
 from fusion_service.linalg import congruence, matvec, outer, to_first, to_last
 from schemas import Ecef, Enu, Frame, Height, Local
@@ -28,7 +29,6 @@ __all__ = [
     "transform",
 ]
 
-Floats = NDArray[np.float64]
 Triple = tuple[Floats, Floats, Floats]
 
 A = 6378137.0

@@ -22,10 +22,12 @@ from collections.abc import Iterator
 from math import prod
 
 import numpy as np
-from numpy.typing import NDArray
+
+from fusion_service.arrays import Bools, Floats
 
 __all__ = [
     "blocks",
+    "condition",
     "congruence",
     "det",
     "inner",
@@ -48,8 +50,6 @@ __all__ = [
     "trace_inverse_det",
 ]
 
-FloatArray = NDArray[np.float64]
-
 CACHE_BYTES = 1 << 19
 """What one block's (n, n, B) array may occupy: half a megabyte, some 4,000 matrices at n = 4."""
 
@@ -57,7 +57,7 @@ TURN = 128
 """Elements transposed at a time: five times faster than a long array at once."""
 
 
-def to_last(a: FloatArray, core: int) -> FloatArray:
+def to_last(a: Floats, core: int) -> Floats:
     """Flatten the leading batch axes of `a` and move them last: (..., *core axes) -> (*core axes, B).
 
     `core` is the number of trailing axes that make one element (1: vectors, 2: matrices). Contiguous copy.
@@ -72,7 +72,7 @@ def to_last(a: FloatArray, core: int) -> FloatArray:
     return out
 
 
-def to_first(a: FloatArray, batch: tuple[int, ...], core: int, out: FloatArray | None = None) -> FloatArray:
+def to_first(a: Floats, batch: tuple[int, ...], core: int, out: Floats | None = None) -> Floats:
     """The inverse of `to_last`: (*core axes, B) -> (*batch, *core axes), a contiguous copy, or into `out`."""
     shape = a.shape[:core]
     size, entries = prod(batch), prod(shape)
@@ -91,7 +91,7 @@ def blocks(n: int, size: int, copies: int = 1) -> Iterator[slice]:
     return (slice(i, min(i + step, size)) for i in range(0, size, step))
 
 
-def inverse(P: FloatArray) -> FloatArray:
+def inverse(P: Floats) -> Floats:
     """P^-1 (n, n, B) of symmetric positive definite P."""
     out = np.empty(P.shape, P.dtype)
     with np.errstate(all="ignore"):
@@ -101,7 +101,7 @@ def inverse(P: FloatArray) -> FloatArray:
     return out
 
 
-def sweep(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def sweep(P: Floats) -> tuple[Floats, Floats, Floats]:
     """P^-1 (n, n, B), det P (B,) and margin (B,), in one elimination.
 
     The margin is the smallest pivot relative to its diagonal entry, NaN or negative for a bad matrix:
@@ -117,7 +117,7 @@ def sweep(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return out, det, margin
 
 
-def inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def inverse_det(P: Floats) -> tuple[Floats, Floats, Floats]:
     """P^-1 (n, n, B), det P (B,) and its least reciprocal pivot (B,), which is positive if all pivots are.
 
     For callers who look at the condition of P, and need no margin.
@@ -131,7 +131,7 @@ def inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     return out, det, least
 
 
-def trace_inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+def trace_inverse_det(P: Floats) -> tuple[Floats, Floats]:
     """tr P^-1 (B,) and det P (B,)."""
     trace, det = np.empty(P.shape[2:], P.dtype), np.empty(P.shape[2:], P.dtype)
     with np.errstate(all="ignore"):
@@ -149,7 +149,7 @@ def trace_inverse_det(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     return trace, det
 
 
-def _pieces(P: FloatArray, out: FloatArray | None = None) -> Iterator[tuple[FloatArray, FloatArray, slice]]:
+def _pieces(P: Floats, out: Floats | None = None) -> Iterator[tuple[Floats, Floats, slice]]:
     """P and `out`, or room for it, with all batch axes made one, in pieces for the cache."""
     n = len(P)
     p = P.reshape(n, n, -1)
@@ -159,12 +159,12 @@ def _pieces(P: FloatArray, out: FloatArray | None = None) -> Iterator[tuple[Floa
         yield piece, np.empty(piece.shape, P.dtype) if W is None else W[..., part], part
 
 
-def _diagonal(P: FloatArray) -> FloatArray:
+def _diagonal(P: Floats) -> Floats:
     """A view, (n, B)."""
     return np.moveaxis(P.diagonal(), -1, 0)
 
 
-def _factor(P: FloatArray, W: FloatArray, det: FloatArray | None = None) -> None:
+def _factor(P: Floats, W: Floats, det: Floats | None = None) -> None:
     """1 / d on the diagonal of W and L^-1' above it, of P = L diag(d) L'. Writes det P into `det`.
 
     Below the diagonal of W the elimination is done.
@@ -186,7 +186,7 @@ def _factor(P: FloatArray, W: FloatArray, det: FloatArray | None = None) -> None
             W[:k, i] += W[:k, k] * W[k, i]
 
 
-def _square(W: FloatArray) -> None:
+def _square(W: Floats) -> None:
     """P^-1 = W' D^-1 W from `_factor`, in place, as LAPACK's potri does it."""
     n = len(W)
     for k in range(1, n):
@@ -198,7 +198,7 @@ def _square(W: FloatArray) -> None:
         W[:i, i] = W[i, :i]
 
 
-def ldl(P: FloatArray) -> tuple[FloatArray, FloatArray]:
+def ldl(P: Floats) -> tuple[Floats, Floats]:
     """Factors of P = L diag(d) L': unit lower triangular L (n, n, B) and pivots d (n, B)."""
     n = P.shape[0]
     L = np.zeros(P.shape, P.dtype)
@@ -214,7 +214,7 @@ def ldl(P: FloatArray) -> tuple[FloatArray, FloatArray]:
     return L, d
 
 
-def _pivots(P: FloatArray) -> FloatArray:
+def _pivots(P: Floats) -> Floats:
     n = len(P)
     out = np.empty(P.shape[1:], P.dtype)
     for p, A, part in _pieces(P):
@@ -230,27 +230,27 @@ def _pivots(P: FloatArray) -> FloatArray:
     return out
 
 
-def det(P: FloatArray) -> FloatArray:
+def det(P: Floats) -> Floats:
     """det P (B,), as the product of the pivots."""
     with np.errstate(all="ignore"):
         d = _pivots(P)
-        product: FloatArray = d[0].copy()
+        product: Floats = d[0].copy()
         for k in range(1, len(d)):
             product *= d[k]
     return product
 
 
-def logdet(P: FloatArray) -> FloatArray:
+def logdet(P: Floats) -> Floats:
     """log det P (B,); NaN where a pivot is negative, -inf where one is zero."""
     with np.errstate(all="ignore"):
         logs = np.log(_pivots(P))
-        total: FloatArray = logs[0].copy()
+        total: Floats = logs[0].copy()
         for k in range(1, len(logs)):
             total += logs[k]
     return total
 
 
-def solve(P: FloatArray, x: FloatArray) -> FloatArray:
+def solve(P: Floats, x: Floats) -> Floats:
     """P^-1 x (n, B) for x (n, B)."""
     n = P.shape[0]
     L, d = ldl(P)
@@ -262,27 +262,27 @@ def solve(P: FloatArray, x: FloatArray) -> FloatArray:
     return y
 
 
-def quadratic(P: FloatArray, x: FloatArray) -> FloatArray:
+def quadratic(P: Floats, x: Floats) -> Floats:
     """x' P^-1 x (B,) for x (n, B): the squared Mahalanobis distance."""
     L, d = ldl(P)
     with np.errstate(all="ignore"):
         y = _forward(L, x)
         y *= y
         y /= d
-        total: FloatArray = y[0].copy()
+        total: Floats = y[0].copy()
         for k in range(1, len(y)):
             total += y[k]
     return total
 
 
-def _forward(L: FloatArray, x: FloatArray) -> FloatArray:
+def _forward(L: Floats, x: Floats) -> Floats:
     y = np.array(np.broadcast_to(x, L.shape[1:]), dtype=L.dtype)
     for k in range(len(y) - 1):
         y[k + 1 :] -= L[k + 1 :, k] * y[k]
     return y
 
 
-def is_positive_definite(P: FloatArray, tolerance: float = 1e-14) -> NDArray[np.bool_]:
+def is_positive_definite(P: Floats, tolerance: float = 1e-14) -> Bools:
     """Which P are numerically positive definite, (B,).
 
     Every pivot must exceed `tolerance` times its diagonal entry, that is, 1 minus the squared multiple
@@ -291,7 +291,7 @@ def is_positive_definite(P: FloatArray, tolerance: float = 1e-14) -> NDArray[np.
     """
     with np.errstate(all="ignore"):
         d = _pivots(P)
-        good: NDArray[np.bool_] = np.ones(P.shape[2:], dtype=np.bool_)
+        good: Bools = np.ones(P.shape[2:], dtype=np.bool_)
         for k in range(len(d)):
             good &= d[k] > tolerance * P[k, k]
             good &= d[k] > 0.0
@@ -299,42 +299,55 @@ def is_positive_definite(P: FloatArray, tolerance: float = 1e-14) -> NDArray[np.
     return good
 
 
-def symmetrise(P: FloatArray) -> FloatArray:
-    """(P + P') / 2."""
-    out: FloatArray = 0.5 * (P + P.swapaxes(0, 1))
+def condition(P: Floats, A: Floats) -> Floats:
+    """max_k P_kk A_kk (...) for A = P^-1 (n, n, ...): the largest variance inflation factor.
+
+    Whatever the units of the components, the condition number of the correlation matrix lies between this and n^2
+    times this. P^-1 by elimination is the inverse of some P + dP with A + dA within a factor 1 +- n^2 eps condition
+    of A as quadratic forms, and such factors pass through sums: it tells how good what is made of inverses is.
+    """
+    out: Floats = P[0, 0] * A[0, 0]
+    for k in range(1, len(P)):
+        np.maximum(out, P[k, k] * A[k, k], out=out)
     return out
 
 
-def matvec(A: FloatArray, x: FloatArray) -> FloatArray:
+def symmetrise(P: Floats) -> Floats:
+    """(P + P') / 2."""
+    out: Floats = 0.5 * (P + P.swapaxes(0, 1))
+    return out
+
+
+def matvec(A: Floats, x: Floats) -> Floats:
     """A x, (m, B): x (n, B), A (m, n, B), or one A (m, n) for the whole batch."""
     if A.ndim == 2:
         A = A.reshape(*A.shape, *(1,) * (x.ndim - 1))
     with np.errstate(all="ignore"):
-        out: FloatArray = A[:, 0] * x[0]
+        out: Floats = A[:, 0] * x[0]
         for k in range(1, A.shape[1]):
             out += A[:, k] * x[k]
     return out
 
 
-def outer(x: FloatArray, y: FloatArray) -> FloatArray:
+def outer(x: Floats, y: Floats) -> Floats:
     """x y', (m, n, B), for x (m, B) and y (n, B)."""
-    out: FloatArray = x[:, None] * y[None, :]
+    out: Floats = x[:, None] * y[None, :]
     return out
 
 
-def product(A: FloatArray, B: FloatArray) -> FloatArray:
+def product(A: Floats, B: Floats) -> Floats:
     """A B, (m, n, B), for A (m, k, B) and B (k, n, B)."""
     with np.errstate(all="ignore"):
-        out: FloatArray = A[:, 0, None] * B[None, 0]
+        out: Floats = A[:, 0, None] * B[None, 0]
         for k in range(1, A.shape[1]):
             out += A[:, k, None] * B[None, k]
     return out
 
 
-def inner(A: FloatArray, B: FloatArray) -> FloatArray:
+def inner(A: Floats, B: Floats) -> Floats:
     """tr(A B), (B,), for symmetric A and B."""
     with np.errstate(all="ignore"):
-        out: FloatArray = A[0, 0] * B[0, 0]
+        out: Floats = A[0, 0] * B[0, 0]
         for i in range(1, len(A)):
             twice = A[i, 0] * B[i, 0]
             for j in range(1, i):
@@ -344,23 +357,23 @@ def inner(A: FloatArray, B: FloatArray) -> FloatArray:
     return out
 
 
-def trace(A: FloatArray) -> FloatArray:
+def trace(A: Floats) -> Floats:
     """tr A, (B,)."""
-    out: FloatArray = A[0, 0].copy()
+    out: Floats = A[0, 0].copy()
     for i in range(1, len(A)):
         out += A[i, i]
     return out
 
 
-def total(a: FloatArray) -> FloatArray:
+def total(a: Floats) -> Floats:
     """Sum over the first axis in its order; `np.sum` chooses the order by the shape of the batch."""
-    out: FloatArray = np.array(a[0])
+    out: Floats = np.array(a[0])
     for row in a[1:]:
         out += row
     return out
 
 
-def congruence(F: FloatArray, P: FloatArray) -> FloatArray:
+def congruence(F: Floats, P: Floats) -> Floats:
     """F P F' (m, m, B), exactly symmetric: P (n, n, B), F (m, n, B), or one F (m, n) for the whole batch.
 
     Zeros of a shared F are skipped, so a sparse transition matrix is cheap.

@@ -6,7 +6,6 @@ from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, min_weight_full_bipartite_matching
@@ -14,8 +13,10 @@ from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 
 __all__ = [
+    "DENSE",
     "Gospa",
     "assign",
     "assign_near",
@@ -28,8 +29,6 @@ __all__ = [
     "ospa",
 ]
 
-Floats = NDArray[np.float64]
-Indices = NDArray[np.intp]
 Tree: TypeAlias = cKDTree
 
 DENSE = 2500
@@ -48,7 +47,7 @@ class Gospa(NamedTuple):
     localisation: float
     missed: float
     false: float
-    assignment: NDArray[np.intp]
+    assignment: Ints
 
 
 def gospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0, alpha: float = 2.0) -> Gospa:
@@ -69,7 +68,7 @@ def gospa(truth: Floats, estimates: Floats, c: float, p: float = 2.0, alpha: flo
     return Gospa((localisation + missed + false) ** (1 / p), localisation, missed, false, assignment)
 
 
-def near_pairs(truth: Floats | Tree, estimates: Floats, c: float) -> tuple[Indices, Indices, Floats]:
+def near_pairs(truth: Floats | Tree, estimates: Floats, c: float) -> tuple[Ints, Ints, Floats]:
     """All pairs of `truth` (T, d), or a tree of it, and `estimates` (M, d) closer than c: rows and columns (K,), by
     row and then column, and their distances (K,)."""
     places = truth.data if isinstance(truth, cKDTree) else truth
@@ -88,7 +87,7 @@ def near_pairs(truth: Floats | Tree, estimates: Floats, c: float) -> tuple[Indic
     return i[close], j[close], distance[close]
 
 
-def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[Indices, Indices, Floats]:
+def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[Ints, Ints, Floats]:
     """The assignment of (T, d) to (M, d) that both metrics use: rows and columns (K,) of its pairs closer than c, by
     row, and their distances (K,)."""
     i, j, d = near_pairs(truth, estimates, c)
@@ -96,7 +95,7 @@ def assign(truth: Floats, estimates: Floats, c: float, p: float = 2.0) -> tuple[
     return i[kept], j[kept], d[kept]
 
 
-def assign_near(i: Indices, j: Indices, gain: Floats, shape: tuple[int, int]) -> Indices:
+def assign_near(i: Ints, j: Ints, gain: Floats, shape: tuple[int, int]) -> Ints:
     """Which of the pairs (i, j), by row and then column, are assigned: one for each row and each column at most, with
     the largest sum of gains, all above 0. In the order of the pairs.
 
@@ -118,7 +117,7 @@ def assign_near(i: Indices, j: Indices, gain: Floats, shape: tuple[int, int]) ->
     return np.sort(np.concatenate(chosen))
 
 
-def _best(i: Indices, j: Indices, gain: Floats) -> Indices:
+def _best(i: Ints, j: Ints, gain: Floats) -> Ints:
     """The same for one part, K > 0 pairs; in any order."""
     if len(i) == 2:  # they share a row or a column
         return np.array([int(gain[1] > gain[0])]) if i[0] == i[1] or j[0] == j[1] else np.arange(2)
@@ -131,13 +130,13 @@ def _best(i: Indices, j: Indices, gain: Floats) -> Indices:
         edges = np.concatenate([row, rows]), np.concatenate([column, len(others) + rows])
         matched = min_weight_full_bipartite_matching(coo_array((cost, edges)).tocsr())
         wanted = matched[0] * (len(others) + len(some)) + matched[1]
-        found: Indices = np.flatnonzero(np.isin(row * (len(others) + len(some)) + column, wanted))
+        found: Ints = np.flatnonzero(np.isin(row * (len(others) + len(some)) + column, wanted))
         return found
     worth = np.zeros((len(some), len(others)))
     worth[row, column] = gain
     pair = np.full(worth.shape, -1)
     pair[row, column] = np.arange(len(i))
-    kept: Indices = pair[linear_sum_assignment(worth, maximize=True)]
+    kept: Ints = pair[linear_sum_assignment(worth, maximize=True)]
     return kept[kept >= 0]
 
 
@@ -160,7 +159,7 @@ def nees_bounds(n: int, samples: int, probability: float = 0.95) -> tuple[float,
 
     For a consistent estimate n * samples * average is chi-square with n * samples degrees of freedom
     (Bar-Shalom, Li, Kirubarajan, 2001, 5.4.2). Errors along one track are correlated: there the true
-    bounds are wider.
+    bounds are wider. Raises ValueError for n or samples below 1, or a probability not between 0 and 1.
     """
     if n < 1 or samples < 1 or not 0 < probability < 1:
         raise ValueError(f"bounds need n, samples >= 1 and 0 < probability < 1: {n}, {samples}, {probability}")

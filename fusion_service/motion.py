@@ -12,14 +12,13 @@ from __future__ import annotations
 from math import factorial
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.linalg import congruence, matvec
 from schemas import Motion
 
 __all__ = ["predict"]
 
-Floats = NDArray[np.float64]
 
 AXES = (("x", "vx", "ax"), ("y", "vy", "ay"), ("z", "vz", "az"))
 SMALL_TURN = 0.25
@@ -74,7 +73,7 @@ def _kinematics(motion: Motion, space: tuple[str, ...], dt: Floats) -> tuple[Flo
 
 
 def _chains(space: tuple[str, ...]) -> list[list[int]]:
-    """Indices of successive derivatives that stand in the space together: x vx, say, and y alone."""
+    """Ints of successive derivatives that stand in the space together: x vx, say, and y alone."""
     chains: list[list[int]] = []
     for names in AXES:
         chain: list[int] = []

@@ -14,7 +14,7 @@ from fusion_service.errors import UsageError
 from fusion_service.process import argument, data_folder, exit_code, positive, stop_on_signals, whole
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
-from sensor_clients.playback import autoferry, table
+from sensor_clients.playback import autoferry, radar_v2x, table
 from sensor_clients.publisher import TrackPublisher, TruthPublisher
 from sensor_clients.runner import pace
 from sensor_clients.scenarios.three_radars import TRACKERS, three_radars
@@ -28,6 +28,7 @@ EXAMPLES = """examples:
   sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
   sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
+  sensor-client playback radar-v2x --sensor radar --data /data
   sensor-client playback tracks.csv --sensor radar1        what `fusion-service export` has written
 """
 
@@ -53,9 +54,11 @@ def _parser() -> argparse.ArgumentParser:
     simulate.set_defaults(run=_simulate)
     playback = _command(commands, "playback", "play recorded returns through a local tracker, or tracks", EXAMPLES)
     numbers = ", ".join(map(str, autoferry.SCENARIOS))
-    playback.add_argument("scenario", help=f"autoferry:N, N one of {numbers}; or a .csv or .parquet file of tracks")
     playback.add_argument(
-        "--data", type=Path, help="directory of the scenario files, or that holds autoferry/ (default: $FUSION_DATA)"
+        "scenario", help=f"autoferry:N, N one of {numbers}; radar-v2x; or a .csv or .parquet file of tracks"
+    )
+    playback.add_argument(
+        "--data", type=Path, help="directory of the recording, or that holds it by its name (default: $FUSION_DATA)"
     )
     playback.set_defaults(run=_playback)
     for command in (simulate, playback):
@@ -95,6 +98,10 @@ def _list(_: argparse.Namespace) -> None:
     print(f"playback autoferry:N  N in {', '.join(map(str, autoferry.SCENARIOS))}: {autoferry.SUMMARY}")
     print(f"  sensors: {', '.join(autoferry.SENSORS)}, truth; needs --data or FUSION_DATA")
     print(_table(autoferry.PARAMETERS))
+    print()
+    print(f"playback radar-v2x  {radar_v2x.SUMMARY}")
+    print(f"  sensors: {', '.join(radar_v2x.SENSORS)}; needs --data or FUSION_DATA")
+    print(_table(radar_v2x.PARAMETERS))
 
 
 def _describe(scenario: Scenario, command: str) -> str:
@@ -118,10 +125,20 @@ def _playback(arguments: argparse.Namespace) -> None:
     if path.suffix in table.SUFFIXES:
         _publish(table.load(path), arguments, 0, table.lineage(path, arguments.sensor))
         return
+    if arguments.scenario == "radar-v2x":
+        folder = data_folder("radar-v2x", arguments.data)
+        if folder is None:
+            raise UsageError(
+                "no data: say --data DIR or set FUSION_DATA to the directory of radar.csv, or one above it"
+            )
+        _publish(radar_v2x.load(radar_v2x.find(folder)), arguments, 0)
+        return
     name, _, number = arguments.scenario.partition(":")
     if name != "autoferry" or number not in map(str, autoferry.SCENARIOS):
         known = ", ".join(f"autoferry:{n}" for n in autoferry.SCENARIOS)
-        raise UsageError(f"no recorded scenario {arguments.scenario!r}; known: {known}, or a .csv or .parquet file")
+        raise UsageError(
+            f"no recorded scenario {arguments.scenario!r}; known: {known}, radar-v2x, or a .csv or .parquet file"
+        )
     data = data_folder("autoferry", arguments.data)
     if data is None:
         raise UsageError("no data: say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")

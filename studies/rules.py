@@ -13,15 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.errors import FusionError
-from fusion_service.rules import RULES, RuleError, fuse_last
-from fusion_service.rules.face import Fused
+from fusion_service.rules import RULES, Fused, RuleError, fuse_last
 
 __all__ = ["Fuser", "OwnRuleError", "fuser"]
-
-Floats = NDArray[np.float64]
 
 
 class OwnRuleError(FusionError):

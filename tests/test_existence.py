@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 from scipy.special import xlogy
 from scipy.stats import binom, poisson
 
+from fusion_service.arrays import Floats
 from fusion_service.existence import (
     ExistenceError,
     cardinality_map,
@@ -27,7 +27,6 @@ from fusion_service.existence import (
 )
 from tests.helpers.strategies import seeds
 
-Array = NDArray[np.float64]
 probabilities = st.floats(0.0, 1.0)
 inside = st.floats(1e-6, 1.0 - 1e-6)
 METHODS: tuple[tuple[str, dict[str, float]], ...] = (
@@ -38,7 +37,7 @@ LARGE = np.stack([binom.pmf(np.arange(36), 35, p) for p in (0.98, 0.975)])
 """Uney's example 3.6."""
 
 
-def least(p: Array, q: Array) -> Array:
+def least(p: Floats, q: Floats) -> Floats:
     """The weighted geometric mean of two pmfs with the least normalisation, by search (Uney P4)."""
     best = minimize_scalar(
         lambda w: (p ** (1 - w) * q**w).sum(), bounds=(0, 1), method="bounded", options={"xatol": 1e-10}
@@ -170,7 +169,7 @@ def test_32_is_not_necessary() -> None:
 
 
 @pytest.mark.parametrize(("pmfs", "omega", "number"), [(SMALL, 0.5182, 5), (LARGE, 0.5090, 35)])
-def test_uney_example_4_3(pmfs: Array, omega: float, number: int) -> None:
+def test_uney_example_4_3(pmfs: Floats, omega: float, number: int) -> None:
     p, w = fuse_cardinality(pmfs)
     assert w[1] == pytest.approx(omega, abs=2e-4)
     assert cardinality_map(p) == number

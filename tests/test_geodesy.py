@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pymap3d
 import pytest
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.geodesy import (
     FrameError,
     ecef_to_geodetic,
@@ -17,7 +17,6 @@ from fusion_service.geodesy import (
 )
 from schemas import Ecef, Enu, Frame, Height, Local
 
-Array = NDArray[np.float64]
 SEED = 20250702
 RNG = np.random.default_rng(SEED)
 SPACE_2D = ("x", "vx", "y", "vy")
@@ -26,14 +25,14 @@ OSLO, BERGEN, SVALBARD = Enu(59.9, 10.7, 30.0), Enu(60.4, 5.3, 250.0), Enu(78.2,
 FRAMES: list[Frame] = [OSLO, BERGEN, SVALBARD, Enu(-90.0, 0.0, 0.0), Enu(-33.0, 179.9, 10.0), Ecef()]
 
 
-def covariance(rng: np.random.Generator, sigmas: Array) -> Array:
+def covariance(rng: np.random.Generator, sigmas: Floats) -> Floats:
     a = rng.normal(size=(len(sigmas), len(sigmas)))
     p = a @ a.T + np.eye(len(sigmas))
     s = sigmas / np.sqrt(np.diag(p))
     return np.asarray(p * np.outer(s, s))
 
 
-def places(size: int) -> tuple[Array, Array, Array]:
+def places(size: int) -> tuple[Floats, Floats, Floats]:
     """Latitudes, longitudes (degrees) and altitudes (m) over all the Earth, poles and date line among them."""
     lat, lon, alt = RNG.uniform(-90, 90, size), RNG.uniform(-180, 180, size), RNG.uniform(-1e4, 1e6, size)
     lat[:3], lon[3], lon[4] = (90.0, -90.0, 0.0), 180.0, -180.0
@@ -75,10 +74,10 @@ def test_with_z_a_state_moves_as_its_trajectory_does(source: Frame, target: Fram
     """Positions by pymap3d; velocity and acceleration from three positions on the parabola of the state."""
     lat, lon, alt = np.array([61.0, 77.0, 59.0]), np.array([7.0, 20.0, 10.0]), np.array([0.0, 9000.0, 100.0])
 
-    def to(frame: Frame, xyz: Array) -> Array:
+    def to(frame: Frame, xyz: Floats) -> Floats:
         return np.array(pymap3d.ecef2enu(*xyz, frame.lat, frame.lon, frame.alt) if isinstance(frame, Enu) else xyz)
 
-    def ecef(frame: Frame, xyz: Array) -> Array:
+    def ecef(frame: Frame, xyz: Floats) -> Floats:
         return np.array(pymap3d.enu2ecef(*xyz, frame.lat, frame.lon, frame.alt) if isinstance(frame, Enu) else xyz)
 
     p = to(source, np.array(pymap3d.geodetic2ecef(lat, lon, alt)))
@@ -134,7 +133,7 @@ def test_without_z_the_jacobian_is_the_derivative_of_the_map() -> None:
     covs = np.stack([covariance(RNG, RNG.uniform(0.1, 30, n)) for _ in range(50)])
     moved, spread = transform(means, covs, space, OSLO, SVALBARD, Height(500.0))
 
-    def place(dx: float, dy: float) -> Array:
+    def place(dx: float, dy: float) -> Floats:
         offset = np.zeros(n)
         offset[[3, 1]] = dx, dy
         return transform(means + offset, covs, space, OSLO, SVALBARD, Height(500.0))[0][:, [3, 1]]

@@ -2,18 +2,19 @@
 
 import warnings
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats
 
-Array = NDArray[np.float64]
 SEED = 20240611
 
 
-def spd(rng: np.random.Generator, n: int, size: int) -> Array:
+def spd(rng: np.random.Generator, n: int, size: int) -> Floats:
     """(size, n, n), eigenvalues spread over a few decades."""
     q, _ = np.linalg.qr(rng.normal(size=(size, n, n)))
     p = (q * 10.0 ** rng.uniform(-2, 2, size=(size, 1, n))) @ q.swapaxes(1, 2)
@@ -21,7 +22,7 @@ def spd(rng: np.random.Generator, n: int, size: int) -> Array:
 
 
 @pytest.fixture(params=[1, 2, 3, 4, 6, 12])
-def case(request: pytest.FixtureRequest) -> tuple[int, Array, Array]:
+def case(request: pytest.FixtureRequest) -> tuple[int, Floats, Floats]:
     n = request.param
     rng = np.random.default_rng(SEED + n)
     return n, spd(rng, n, 40), rng.normal(size=(40, n))
@@ -45,10 +46,10 @@ def test_blocks_cover_the_batch_once() -> None:
         np.testing.assert_array_equal(seen, np.arange(size))
 
 
-def test_against_numpy(case: tuple[int, Array, Array]) -> None:
+def test_against_numpy(case: tuple[int, Floats, Floats]) -> None:
     _, P, x = case
     p, v = linalg.to_last(P, 2), linalg.to_last(x, 1)
-    close = {"rtol": 1e-10, "atol": 1e-10}
+    close: dict[str, Any] = {"rtol": 1e-10, "atol": 1e-10}
     want = np.linalg.inv(P)
     inverse, det, _ = linalg.sweep(p)
     np.testing.assert_allclose(linalg.trace_inverse_det(p)[0], np.trace(want, axis1=1, axis2=2), rtol=1e-10)
@@ -75,7 +76,7 @@ def test_against_numpy(case: tuple[int, Array, Array]) -> None:
 
 
 @pytest.mark.parametrize("m", [1, 3, 5])
-def test_products_with_one_matrix_or_many(case: tuple[int, Array, Array], m: int) -> None:
+def test_products_with_one_matrix_or_many(case: tuple[int, Floats, Floats], m: int) -> None:
     n, P, x = case
     rng = np.random.default_rng(SEED)
     p, v = linalg.to_last(P, 2), linalg.to_last(x, 1)
@@ -88,7 +89,7 @@ def test_products_with_one_matrix_or_many(case: tuple[int, Array, Array], m: int
         np.testing.assert_allclose(linalg.matvec(f, v).T, (F @ x[..., None])[..., 0], rtol=1e-12, atol=1e-12)
 
 
-OPERATIONS: dict[str, Callable[[Array, Array], Array]] = {
+OPERATIONS: dict[str, Callable[[Floats, Floats], NDArray[Any]]] = {
     "inverse": lambda p, v: linalg.inverse(p),
     "ldl": lambda p, v: linalg.ldl(p)[0],
     "det": lambda p, v: linalg.det(p),
@@ -135,7 +136,7 @@ def test_a_bad_matrix_spoils_only_itself(name: str, value: float) -> None:
 
 
 def test_positive_definite_means_numerically_so() -> None:
-    def ask(P: Array) -> bool:
+    def ask(P: Floats) -> bool:
         p = np.asarray(P, dtype=float)[..., None]
         answer = bool(linalg.is_positive_definite(p)[0])
         assert answer == (linalg.sweep(p)[2][0] > 1e-14)

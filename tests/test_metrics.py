@@ -5,19 +5,18 @@ from itertools import permutations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 
 from fusion_service import metrics
+from fusion_service.arrays import Floats
 from fusion_service.metrics import gospa, identity_switches, near_pairs, nees, nees_bounds, ospa
 from fusion_service.review.evaluation.continuity import Following, Instant, ospa2, siap_of
 
-Array = NDArray[np.float64]
 SEED = 20250704
 
 
-def brute_force(a: Array, b: Array, c: float, p: float, alpha: float) -> float:
+def brute_force(a: Floats, b: Floats, c: float, p: float, alpha: float) -> float:
     """GOSPA^p by its definition: the best of all injections of the smaller set into the larger."""
     small, large = (a, b) if len(a) <= len(b) else (b, a)
     best = min(
@@ -27,7 +26,7 @@ def brute_force(a: Array, b: Array, c: float, p: float, alpha: float) -> float:
     return float(best + c**p / alpha * (len(large) - len(small)))
 
 
-def sets(count: int) -> list[Array]:
+def sets(count: int) -> list[Floats]:
     rng = np.random.default_rng(SEED)
     return [rng.uniform(0, 10, (rng.integers(0, 6), 2)) for _ in range(count)]
 
@@ -153,7 +152,7 @@ def test_a_large_connected_part_is_assigned_on_its_pairs() -> None:
 
 def moments(
     rng: np.random.Generator, times: int
-) -> tuple[list[Instant], list[dict[int, Array]], list[dict[int, Array]]]:
+) -> tuple[list[Instant], list[dict[int, Floats]], list[dict[int, Floats]]]:
     """Objects and tracks that come and go at random in a small place; the numbers are not 0, 1, 2."""
     found, objects, tracks, c = [], [], [], 5.0
     for _ in range(times):
@@ -175,7 +174,7 @@ def test_ospa2_against_brute_force(times: int) -> None:
     """By its definition: time averages for each pair of tracks, then the best of all injections."""
     rng, c, p = np.random.default_rng(SEED), 5.0, 2.0
 
-    def base(a: int, b: int, objects: list[dict[int, Array]], tracks: list[dict[int, Array]]) -> float:
+    def base(a: int, b: int, objects: list[dict[int, Floats]], tracks: list[dict[int, Floats]]) -> float:
         costs = []
         for here, shown in zip(objects, tracks, strict=True):
             if a in here and b in shown:
@@ -201,9 +200,8 @@ def test_ospa2_against_brute_force(times: int) -> None:
         )
         want = ((best + c**p * (most - len(small))) / most) ** (1 / p) if most else 0.0
         assert ospa2(deque(window), c, p) == pytest.approx(want), f"seed {SEED}"
-    assert ospa2(deque(window[:1]), c, p) == pytest.approx(
-        ospa(*(np.array(list(one[0].values())).reshape(-1, 2) for one in (objects, tracks)), c, p)
-    ), "a window of one time is OSPA"
+    first, shown = (np.array(list(one[0].values())).reshape(-1, 2) for one in (objects, tracks))
+    assert ospa2(deque(window[:1]), c, p) == pytest.approx(ospa(first, shown, c, p)), "a window of one time is OSPA"
 
 
 def test_siap_by_hand() -> None:

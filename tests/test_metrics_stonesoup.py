@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.metrics import gospa, ospa
 from fusion_service.review.evaluation import Evaluation, evaluate
 from schemas import Message
@@ -29,8 +29,7 @@ from stonesoup.types.groundtruth import GroundTruthPath, GroundTruthState
 from stonesoup.types.state import State
 from stonesoup.types.track import Track
 
-Array = NDArray[np.float64]
-Lines = dict[int, tuple[int, Array]]
+Lines = dict[int, tuple[int, Floats]]
 """Number -> first time, and states (L, 4): x, vx, y, vy, one a second."""
 SEED = 20251126
 START = datetime(2025, 1, 1)
@@ -39,7 +38,9 @@ C = 40.0
 
 def lines(rng: np.random.Generator) -> tuple[Lines, Lines]:
     """Targets 200 m apart. Tracks: good ones, doubles, false ones, some that go over to another target."""
-    steps, targets, tracks = 30, {}, {}
+    steps = 30
+    targets: Lines = {}
+    tracks: Lines = {}
     for target in range(6):
         first = int(rng.integers(0, 8))
         count = steps - first - int(rng.integers(0, 6))
@@ -70,7 +71,7 @@ def lines(rng: np.random.Generator) -> tuple[Lines, Lines]:
     return targets, tracks
 
 
-def at_times(all_lines: Lines) -> list[tuple[list[int], Array]]:
+def at_times(all_lines: Lines) -> list[tuple[list[int], Floats]]:
     found = []
     for k in range(30):
         here = {n: states[k - first] for n, (first, states) in all_lines.items() if 0 <= k - first < len(states)}

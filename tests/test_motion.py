@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad_vec, solve_ivp
 from scipy.linalg import expm
 
+from fusion_service.arrays import Floats
 from fusion_service.motion import predict
 from schemas import Motion
 
-Array = NDArray[np.float64]
 SEED = 20250703
 CT = ("vx", "turn_rate", "y", "x", "vy")
 
@@ -27,7 +26,7 @@ CHAINS: dict[tuple[str, ...], tuple[list[tuple[str, str]], list[str]]] = {
 }
 
 
-def spd(rng: np.random.Generator, n: int, size: int) -> Array:
+def spd(rng: np.random.Generator, n: int, size: int) -> Floats:
     a = rng.normal(size=(n, n, size))
     return np.asarray(np.einsum("ikb,jkb->ijb", a, a) + np.eye(n)[:, :, None])
 
@@ -52,7 +51,7 @@ def test_cv_against_matrix_exponential_and_integral(space: tuple[str, ...], kind
         np.testing.assert_allclose(covs[:, :, k], F @ P[:, :, k] @ F.T + Q, rtol=1e-11, atol=1e-12)
 
 
-def turn_ode(_: float, s: Array) -> list[float]:
+def turn_ode(_: float, s: Floats) -> list[float]:
     vx, w, _y, _x, vy = s
     return [-w * vy, 0.0, vy, vx, w * vx]
 

@@ -40,8 +40,9 @@ SLOPE = 0.2
 FAR = 3.0
 """Gates beyond the gate at which a disagreement has its whole weight."""
 MERGE_SLOPE = 0.3
-YOUNG = 10
-"""Data after which a link has its whole weight against an exchange."""
+WEIGHT = ((0, 10, 30), (0.0, 0.1, 0.5))
+"""What a standing link weighs against an exchange, in units of A, after so many data: a young one next to nothing,
+since the first pairing of a formation is mostly wrong; two mature ones A together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +79,7 @@ class Tests:
 
     def weight(self, data: NDArray[np.integer]) -> Floats:
         """What a standing link weighs against an exchange, after so many data (M,)."""
-        return np.asarray(0.1 * self.bound * np.minimum(data, YOUNG) / YOUNG)
+        return np.asarray(self.bound * np.interp(data, *WEIGHT))
 
 
 @dataclass(slots=True)

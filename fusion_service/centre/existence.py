@@ -12,8 +12,8 @@ each and their sum bounded by `MOST`.
   `false_track`, the chance that a report of a track of it is of nothing.
 * A complete scan of a source that covers the place and has no new datum of the track is evidence, log(1 - p), once per
   scan received (the Bernoulli filter's r' = r (1 - p) / (1 - r p)), after the track has been in its coverage for its
-  initiation delay, and until it sees the track. Where coverage or detection probability is not declared, nothing is
-  lowered.
+  initiation delay; what a source has missed is made good first by its own new data, and at once by its opinion. Where
+  coverage or detection probability is not declared, nothing is lowered.
 * Without any new datum the target may be gone: r' = r s^dt, s the `survival` of a second.
 """
 
@@ -117,7 +117,8 @@ def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entr
     gain = np.array([_gain(intake.declared(intake.sources[name])) for name in intake.names()])
     counted = fresh & ~says
     np.add.at(evidence, at[counted], gain[rows.source[inside[counted]]])
-    missed = _missed(rows, picture, intake, entries, time)
+    missed, spent = _missed(rows, picture, intake, entries, gain, time)
+    evidence = evidence - spent
     evidence = np.clip(opinion + evidence, -MOST, MOST) - opinion
     if before >= 0:
         quiet = ~hit & (picture.time >= 0)
@@ -164,10 +165,12 @@ def _gain(declared: SourceConfig) -> float:
     return float(np.log(max(p, declared.false_track) / declared.false_track))
 
 
-def _missed(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time: int) -> Floats:
-    """What all scans that show nothing new of a track, so far, take from its log-odds (G,). What a source has missed
-    is forgiven when it sees the track."""
-    whole = np.zeros(len(picture.id))
+def _missed(
+    rows: Rows, picture: Picture, intake: Intake, entries: Entries, gain: Floats, time: int
+) -> tuple[Floats, Floats]:
+    """What all scans that show nothing new of a track, so far, take from its log-odds (G,); and how much of the gain
+    (N,) of new data only made good what their own sources had missed. An opinion of a source makes good all of it."""
+    whole, spent = np.zeros(len(picture.id)), np.zeros(len(picture.id))
     frame = intake.frame
     sensors = {name: intake.sensor(source) for name, source in sorted(intake.sources.items()) if not source.muted}
     looking = {
@@ -177,7 +180,7 @@ def _missed(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time
     }
     entries.forget_others(set(looking))
     if frame is None or not len(picture.id):
-        return whole
+        return whole, spent
     places = [intake.config.space.index(axis) for axis in ("x", "y", "z") if axis in intake.config.space]
     index = {name: number for number, name in enumerate(intake.names())}
     for name, said in looking.items():
@@ -185,15 +188,20 @@ def _missed(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time
         covered = (picture.time >= 0) & covers(said, picture.mean[places], frame)
         since = np.where(covered, np.where(since >= 0, np.minimum(since, time), time), -1)
         mine = rows.source == index[name]
-        seen = np.isin(picture.id, rows.tracks.link[mine & rows.fresh & ~rows.tracks.outside])
+        new = mine & rows.fresh & ~rows.tracks.outside
+        seen = np.isin(picture.id, rows.tracks.link[new])
+        says = np.isin(picture.id, rows.tracks.link[new & np.isfinite(rows.tracks.existence)])
         unsure = np.isin(picture.id, rows.tracks.link[mine & rows.tracks.outside])
         missed = covered & ~seen & ~unsure & (time - since >= said.initiation_delay * 1e9)
         p = min(float(said.detection_probability or 0.0), MOST_CERTAIN)
         more = intake.sources[name].scans * np.log1p(-p)
-        total = np.where(seen, 0.0, np.maximum(np.where(missed, total + more, total), -MOST))
+        again = seen & ~says & (total < 0)
+        spent = spent + np.where(again, gain[index[name]], 0.0)
+        total = np.where(again, np.minimum(total + gain[index[name]], 0.0), np.where(says, 0.0, total))
+        total = np.maximum(np.where(missed, total + more, total), -MOST)
         entries.keep(name, picture, since, total)
         whole = whole + total
-    return whole
+    return whole, spent
 
 
 def _logit(r: Any) -> Any:

@@ -94,8 +94,8 @@ class FusionCentre(Centre):
         seen = np.maximum(picture.seen, newest)
         picture = replace(picture, updated=updated, seen=seen)
         picture = update_existence(rows, picture, self._intake, self._entries, time, self._last)
-        self._last = time
         support = self._support(rows, inside, at, len(picture.id), time)
+        self._last = time
         picture, ended = live_on(picture, time, support, self.config, self._journal)
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
         tracks.link[np.isin(tracks.link, picture.id[ended])] = NO_TRACK
@@ -113,7 +113,7 @@ class FusionCentre(Centre):
         sources = np.bincount(at[expected >= time], minlength=count)
         hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
         linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
-        return Support(sources, hit, due, slowest, linked == 0)
+        return Support(sources, hit, due, slowest, linked == 0, self._last)
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()

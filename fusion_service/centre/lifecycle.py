@@ -5,8 +5,8 @@ predicts on, its `updated` standing still, gives none). A track is confirmed by 
 were due, at the pace of its own sources, or at once by several sources. It coasts when the next report of every
 contributor is overdue, and ends after `coast` seconds or `coast_periods` of the slowest contributor, whichever is
 longer; a tentative one when N reports were due without a hit. One whose existence falls below `min_existence` is
-tentative again, and ends when overdue. One whose local tracks its sources have all dropped is overdue since its last
-hit. How often the centre steps changes nothing of this.
+tentative again, and ends when overdue. One whose local tracks its sources have all dropped is overdue since the
+last step that had one. How often the centre steps changes nothing of this.
 """
 
 from __future__ import annotations
@@ -109,20 +109,21 @@ class Support:
     """What feeds G global tracks in a step. sources (G,): how many sources whose next report is not overdue; hit (G,):
     whether a new measurement came in; due (G,): ns at which the next report of the last of them is overdue, -1 where
     none is believed; interval (G,): ns between reports of the slowest of them; dropped (G,): no local track is linked
-    any more: what it was made of is gone from its sources' scans."""
+    any more: what it was made of is gone from its sources' scans. before: ns of the last step."""
 
     sources: NDArray[np.intp]
     hit: NDArray[np.bool_]
     due: NDArray[np.int64]
     interval: NDArray[np.int64]
     dropped: NDArray[np.bool_]
+    before: int
 
 
 def advance(picture: Picture, time: int, support: Support, config: CentreConfig) -> tuple[Picture, NDArray[np.bool_]]:
     """Every life at the step at `time`, ns: the picture with new status, and which tracks end now."""
     linked = support.due >= 0
     due = np.where(linked, support.due, picture.due)
-    due = np.where(support.dropped, np.minimum(due, picture.last_hit), due)
+    due = np.where(support.dropped, np.minimum(due, support.before), due)
     interval = np.where(linked, support.interval, picture.interval)
     hits, last = _counted(picture, time, support, interval, config)
     overdue = time > due

@@ -85,8 +85,8 @@ class Linker:
         return picture, merged
 
     def _assign(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> Ints:
-        """Exchange links and let loose rows join, source by source; a track that one source has touched is left to
-        the others until the next step. Returns the rows that joined a track."""
+        """Exchange links and let loose rows join, source by source; a track that takes part in an exchange of
+        one source is left alone by the others until the next step. Returns the rows that joined a track."""
         sums = self._rival_sums(rows, now, near)
         weight = self.tests.weight(rows.tracks.data)
         touched = np.zeros(len(now.id), dtype=np.bool_)
@@ -105,8 +105,10 @@ class Linker:
             given[row[kept]] = track[kept]
             taken = kept[~stays[kept]]
             lost = mine[(given[mine] < 0) & (rows.tracks.link[mine] != NO_TRACK)]
+            exchanged = rows.tracks.link[row[taken]] != NO_TRACK
+            touched[track[taken[exchanged]]] = True
+            touched[now.find(rows.tracks.link[row[taken[exchanged]]])] = True
             self._apply(rows, now, near, row[taken], track[taken], lost, step, journal)
-            touched[track[taken]] = True
             joined.append(row[taken])
             moved.append(row[taken])
         self._keep_rivals(rows, now, near, sums, np.concatenate(moved))

@@ -16,12 +16,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 from fusion_service.densities.mixture import LOG_2PI, Mixture, Mixtures, log_gaussian, log_sum
 from fusion_service.densities.sampling import draws, halved_sum
-from fusion_service.linalg import FloatArray, total
+from fusion_service.linalg import total
 
 __all__ = [
     "chernoff_discrete",
@@ -39,11 +39,11 @@ SWEEPS = 20
 GAP = 1e-10
 """What log z may be above its least value, relative to its slopes, with more than two sources."""
 
-Oracle = Callable[[FloatArray, NDArray[np.intp]], tuple[FloatArray, FloatArray]]
+Oracle = Callable[[Floats, Ints], tuple[Floats, Floats]]
 """Weights (N, b) of the elements at an index (b,): gradient (N, b) and Hessian (N, N, b) of log z."""
 
 
-def kl_gaussians(means: FloatArray, covariances: FloatArray, others: FloatArray, spreads: FloatArray) -> FloatArray:
+def kl_gaussians(means: Floats, covariances: Floats, others: Floats, spreads: Floats) -> Floats:
     """KL(N(m, P) || N(o, S)) (...), batch-last: m, o (n, ...), P, S (n, n, ...) (Uney (55), corrected)."""
     with np.errstate(all="ignore"):
         A, det, _ = linalg.sweep(spreads)
@@ -78,22 +78,20 @@ def kl_bounds(f: Mixture, g: Mixture) -> tuple[float, float]:
     return max(0.0, float(weights @ (low[0] - high[1]))), float(weights @ (high[0] - low[1]))
 
 
-def chernoff_gaussians(means: FloatArray, covariances: FloatArray) -> FloatArray:
+def chernoff_gaussians(means: Floats, covariances: Floats) -> Floats:
     """Chernoff weights (N, B) of Gaussians, means (N, n, B), covariances (N, n, n, B); equal if all are alike."""
     A, det, _ = linalg.sweep(covariances.transpose(1, 2, 0, 3))
     x = (means - means[:1]).transpose(1, 0, 2)
     logdet = np.log(det)
 
-    def oracle(w: FloatArray, at: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    def oracle(w: Floats, at: Ints) -> tuple[Floats, Floats]:
         C = linalg.inverse(total(np.moveaxis(w * A[..., at], 2, 0)))
         return _slopes(w, x[..., at], A[..., at], logdet[:, at], C)[1:]
 
     return _minimise(oracle, *det.shape)
 
 
-def overlap_gaussians(
-    means: FloatArray, covariances: FloatArray, weights: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def overlap_gaussians(means: Floats, covariances: Floats, weights: Floats) -> tuple[Floats, Floats, Floats]:
     """log z (B,) of the weighted geometric mean of Gaussians (Uney (25), corrected), its gradient (N, B) and Hessian
     (N, N, B) in the weights (N, B), which sum to 1: of the gradient only differences mean something.
 
@@ -108,9 +106,7 @@ def overlap_gaussians(
         return -0.5 * (total(weights * logdet) + np.log(precision) + square), gradient, hessian
 
 
-def _slopes(
-    w: FloatArray, x: FloatArray, A: FloatArray, logdet: FloatArray, C: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _slopes(w: Floats, x: Floats, A: Floats, logdet: Floats, C: Floats) -> tuple[Floats, Floats, Floats]:
     """sum_i w_i |x_i - m|^2 in A_i (B,), with the gradient and the Hessian of log z, of precisions A (n, n, N, B)."""
     m = linalg.matvec(C, total((w * linalg.matvec(A, x)).swapaxes(0, 1)))
     d = x - m[:, None]
@@ -125,14 +121,14 @@ def _slopes(
     return total(w * far), gradient, hessian
 
 
-def chernoff_discrete(logs: FloatArray, base: FloatArray) -> FloatArray:
+def chernoff_discrete(logs: Floats, base: Floats) -> Floats:
     """Chernoff weights (N, B) for z(w) = sum_k exp(base_k + sum_i w_i logs_ik), logs (N, K, B), base (K, B).
 
     With base 0 and the logs of probabilities this is Uney's Algorithm 2. What no source allows has base -inf and
     finite logs.
     """
 
-    def oracle(w: FloatArray, at: NDArray[np.intp]) -> tuple[FloatArray, FloatArray]:
+    def oracle(w: Floats, at: Ints) -> tuple[Floats, Floats]:
         l = logs[..., at]
         exponent = base[:, at] + total(w[:, None] * l)
         p = np.exp(exponent - exponent.max(axis=0))
@@ -144,7 +140,7 @@ def chernoff_discrete(logs: FloatArray, base: FloatArray) -> FloatArray:
     return _minimise(oracle, len(logs), logs.shape[-1])
 
 
-def chernoff_mixtures(sources: Sequence[Mixtures], samples: int, seed: int) -> FloatArray:
+def chernoff_mixtures(sources: Sequence[Mixtures], samples: int, seed: int) -> Floats:
     """Chernoff weights (N, B) of N batches of mixtures, z(w) by importance sampling.
 
     The samples, stratified over the components and the same for every w, come in equal parts from each source and
@@ -167,7 +163,7 @@ def chernoff_mixtures(sources: Sequence[Mixtures], samples: int, seed: int) -> F
     return chernoff_discrete(densities[:-1], -log_sum(densities))
 
 
-def _stratified(f: Mixtures, z: FloatArray, seed: int) -> FloatArray:
+def _stratified(f: Mixtures, z: Floats, seed: int) -> Floats:
     """Points (n, S, B) of each mixture from the normal draws z (n, S), every component with its share of them."""
     S = z.shape[1]
     level = np.random.default_rng(seed).permutation((np.arange(S) + 0.5) / S)[:, None]
@@ -183,7 +179,7 @@ def _stratified(f: Mixtures, z: FloatArray, seed: int) -> FloatArray:
     return out
 
 
-def _minimise(oracle: Oracle, N: int, B: int) -> FloatArray:
+def _minimise(oracle: Oracle, N: int, B: int) -> Floats:
     """The w (N, B) on the simplex with the least log z: Newton steps, and lines where one would overshoot."""
     w = np.full((N, B), 1.0 / N)
     todo = np.arange(B)
@@ -211,7 +207,7 @@ def _minimise(oracle: Oracle, N: int, B: int) -> FloatArray:
     return w
 
 
-def _quadratic(w: FloatArray, g: FloatArray, H: FloatArray) -> FloatArray:
+def _quadratic(w: Floats, g: Floats, H: Floats) -> Floats:
     """The v (N, b) on the simplex with nearly the least g'(v - w) + (v - w)'H(v - w) / 2, by moves between two."""
     v, slope = w.copy(), g.copy()
     N = len(w)
@@ -226,7 +222,7 @@ def _quadratic(w: FloatArray, g: FloatArray, H: FloatArray) -> FloatArray:
     return v
 
 
-def _line(oracle: Oracle, w: FloatArray, index: NDArray[np.intp], a: int, b: int) -> FloatArray:
+def _line(oracle: Oracle, w: Floats, index: Ints, a: int, b: int) -> Floats:
     """Newton's method, bracketed, along e_b - e_a."""
     both = w[a] + w[b]
     lo, hi = np.zeros_like(both), both.copy()

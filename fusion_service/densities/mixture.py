@@ -18,10 +18,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Bools, Floats
 from fusion_service.errors import FusionError
-from fusion_service.linalg import FloatArray, total
+from fusion_service.linalg import total
 
 __all__ = [
+    "LOG_2PI",
     "DensityError",
     "Mixture",
     "Mixtures",
@@ -40,21 +42,21 @@ class DensityError(FusionError, ValueError):
     """What is no mixture, or a reduction that cannot be done: one line that says what and why."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Mixture:
     """One Gaussian mixture, checked and copied. Raises DensityError for what is none."""
 
-    weights: FloatArray
+    weights: Floats
     """(C,), not negative, with a positive sum; that of a density is 1"""
-    means: FloatArray
+    means: Floats
     """(C, n)"""
-    covariances: FloatArray
+    covariances: Floats
     """(C, n, n), symmetric positive definite"""
 
-    def __post_init__(self) -> None:
-        for name in ("weights", "means", "covariances"):
+    def __init__(self, weights: ArrayLike, means: ArrayLike, covariances: ArrayLike) -> None:
+        for name, given in (("weights", weights), ("means", means), ("covariances", covariances)):
             try:
-                value = np.array(getattr(self, name), dtype=np.float64)
+                value = np.array(given, dtype=np.float64)
             except (TypeError, ValueError) as error:
                 raise DensityError(f"{name} are not an array of numbers: {error}") from None
             if not np.isfinite(value).all():
@@ -77,27 +79,27 @@ class Mixture:
         """Sum of the weights."""
         return float(self.weights.sum())
 
-    def log_pdf(self, x: ArrayLike) -> FloatArray:
+    def log_pdf(self, x: ArrayLike) -> Floats:
         """log f (...) at x (..., n)."""
         points = np.asarray(x, dtype=np.float64)
         flat = linalg.to_last(points, 1)
         return Mixtures.of([self]).log_pdf(flat[..., None])[:, 0].reshape(points.shape[:-1])
 
-    def pdf(self, x: ArrayLike) -> FloatArray:
+    def pdf(self, x: ArrayLike) -> Floats:
         """f (...) at x (..., n)."""
         return np.asarray(np.exp(self.log_pdf(x)))
 
-    def moments(self) -> tuple[FloatArray, FloatArray]:
+    def moments(self) -> tuple[Floats, Floats]:
         """Mean (n,) and covariance (n, n) of the normalised density."""
         mean, covariance = Mixtures.of([self]).moments()
         return mean[:, 0], covariance[..., 0]
 
-    def draw(self, size: int, seed: int) -> FloatArray:
+    def draw(self, size: int, seed: int) -> Floats:
         """Samples (size, n) of the normalised density."""
         rng = np.random.default_rng(seed)
         which = rng.choice(len(self.weights), size=size, p=self.weights / self.mass)
         z = rng.standard_normal((size, self.means.shape[1]))
-        out: FloatArray = self.means[which]
+        out: Floats = self.means[which]
         L = np.linalg.cholesky(self.covariances)
         for c in range(len(L)):
             at = which == c
@@ -109,16 +111,16 @@ class Mixture:
 class Mixtures:
     """B mixtures of up to C components, batch-last; trusted. Padding has log weight -inf and finite moments."""
 
-    log_weights: FloatArray
+    log_weights: Floats
     """(C, B)"""
-    means: FloatArray
+    means: Floats
     """(n, C, B)"""
-    covariances: FloatArray
+    covariances: Floats
     """(n, n, C, B)"""
 
     @classmethod
     def of(cls, mixtures: Sequence[Mixture]) -> Mixtures:
-        """One batch of mixtures of one state dimension."""
+        """One batch of mixtures of one state dimension; DensityError if they have several, or none is given."""
         if len({m.means.shape[1] for m in mixtures}) != 1:
             raise DensityError("one batch needs mixtures of one state dimension")
         counts = np.array([len(m.weights) for m in mixtures])
@@ -128,9 +130,7 @@ class Mixtures:
         return cls.from_rows(weights, means, P, counts)
 
     @classmethod
-    def from_rows(
-        cls, weights: FloatArray, means: FloatArray, covariances: FloatArray, counts: NDArray[np.integer]
-    ) -> Mixtures:
+    def from_rows(cls, weights: Floats, means: Floats, covariances: Floats, counts: NDArray[np.integer]) -> Mixtures:
         """From components in rows (R,), (R, n), (R, n, n), the first counts[0] >= 1 of them the first track's."""
         sizes = np.asarray(counts, dtype=np.intp)
         step = np.arange(sizes.max(initial=1))[:, None]
@@ -154,7 +154,7 @@ class Mixtures:
             wide.append((logs, p.means[:, index], p.covariances[:, :, index]))
         return cls(*(np.concatenate(arrays, axis=-1) for arrays in zip(*wide, strict=True)))
 
-    def rows(self) -> tuple[FloatArray, FloatArray, FloatArray, NDArray[np.uint16]]:
+    def rows(self) -> tuple[Floats, Floats, Floats, NDArray[np.uint16]]:
         """The inverse of `from_rows`, padding left out."""
         keep = ~np.isneginf(self.log_weights.T)
         return (
@@ -171,21 +171,21 @@ class Mixtures:
         weights, means, covariances, _ = self.take(np.array([index])).rows()
         return Mixture(weights, means, covariances)
 
-    def take(self, index: NDArray[np.integer] | NDArray[np.bool_]) -> Mixtures:
+    def take(self, index: NDArray[np.integer] | Bools) -> Mixtures:
         """The mixtures at `index`."""
         return Mixtures(self.log_weights[:, index], self.means[..., index], self.covariances[..., index])
 
     @property
-    def weights(self) -> FloatArray:
+    def weights(self) -> Floats:
         """(C, B)."""
         return np.asarray(np.exp(self.log_weights))
 
     @property
-    def log_mass(self) -> FloatArray:
+    def log_mass(self) -> Floats:
         """Log of the sum of the weights (B,)."""
         return log_sum(self.log_weights)
 
-    def scaled(self, log_factor: FloatArray) -> Mixtures:
+    def scaled(self, log_factor: Floats) -> Mixtures:
         """Every mixture times exp(log_factor (B,))."""
         return Mixtures(self.log_weights + log_factor, self.means, self.covariances)
 
@@ -193,7 +193,7 @@ class Mixtures:
         """Every mixture scaled to mass 1."""
         return self.scaled(-self.log_mass)
 
-    def moments(self) -> tuple[FloatArray, FloatArray]:
+    def moments(self) -> tuple[Floats, Floats]:
         """Mean (n, B) and covariance (n, n, B) of the normalised densities."""
         w = np.exp(self.log_weights - self.log_mass)
         first = self.means[:, :1]
@@ -202,7 +202,7 @@ class Mixtures:
         spread = w * (self.covariances + linalg.outer(d, d))
         return mean, total(np.moveaxis(spread, 2, 0))
 
-    def log_pdf(self, x: FloatArray) -> FloatArray:
+    def log_pdf(self, x: Floats) -> Floats:
         """log f (S, B) at x (n, S, B), or at the same points x (n, S, 1) for all."""
         L, d = linalg.ldl(self.covariances)
         parts = [
@@ -212,7 +212,7 @@ class Mixtures:
         return log_sum(np.stack(parts))
 
 
-def log_sum(logs: FloatArray) -> FloatArray:
+def log_sum(logs: Floats) -> Floats:
     """log sum exp over the first axis, in its order; -inf where there is nothing."""
     top = logs.max(axis=0)
     top = np.where(np.isfinite(top), top, 0.0)
@@ -220,11 +220,11 @@ def log_sum(logs: FloatArray) -> FloatArray:
         return np.asarray(top + np.log(total(np.exp(logs - top))))
 
 
-def log_gaussian(offset: FloatArray, L: FloatArray, d: FloatArray) -> FloatArray:
+def log_gaussian(offset: Floats, L: Floats, d: Floats) -> Floats:
     """log N(offset; 0, L diag(d) L') for offset (n, ...), L (n, n, ...), d (n, ...) of `linalg.ldl`, broadcast."""
     n = len(offset)
-    rows: list[FloatArray] = []
-    square: FloatArray = np.zeros(())
+    rows: list[Floats] = []
+    square: Floats = np.zeros(())
     with np.errstate(all="ignore"):
         for k in range(n):
             row = offset[k]
@@ -236,8 +236,8 @@ def log_gaussian(offset: FloatArray, L: FloatArray, d: FloatArray) -> FloatArray
 
 
 def moments(
-    means: FloatArray, covariances: FloatArray, weights: FloatArray | None, counts: NDArray[np.uint16] | None
-) -> tuple[FloatArray, FloatArray]:
+    means: Floats, covariances: Floats, weights: Floats | None, counts: NDArray[np.uint16] | None
+) -> tuple[Floats, Floats]:
     """Mean (T, n) and covariance (T, n, n) of each track's mixture of `counts` (T,) components.
 
     means (C, n), covariances (C, n, n), weights (C,), which sum to 1 per track up to rounding and are
@@ -256,13 +256,13 @@ def moments(
         return mean, np.add.reduceat(share[:, None, None] * spread, starts)
 
 
-def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
+def power_product(sources: Sequence[Mixtures], powers: Floats) -> Mixtures:
     """prod_i f_i^{powers_i}, each power to first order: of a sum the sum of the powers (Li-2nd (49)-(51)).
 
     powers (N, B), not negative. Components: one for each choice of a component from every source, the last
     source's running fastest. Exact where a power is 1 or a mixture has one component. Between 0 and 1 the first
     order drops the cross terms and is too large, everywhere: (a + b)^w <= a^w + b^w. A power of 0 is the factor 1.
-    Log weights are NaN where a matrix is so ill-conditioned (max_k P_kk P^-1_kk above `CONDITION`) that the result
+    Log weights are NaN where a matrix is so ill-conditioned (`linalg.condition` above `CONDITION`) that the result
     could be wrong by more than about 1e-6.
     """
     N, n, B = len(sources), len(sources[0].means), len(sources[0])
@@ -272,7 +272,7 @@ def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
     with np.errstate(all="ignore"):
         for i, (f, w) in enumerate(zip(sources, powers, strict=True)):
             A, det, _ = linalg.sweep(f.covariances)
-            bad = bad | ((_condition(f.covariances, A) & (f.log_weights > -np.inf)).any(axis=0) & (w > 0.0))
+            bad = bad | ((_beyond(f.covariances, A) & (f.log_weights > -np.inf)).any(axis=0) & (w > 0.0))
             log_weights = w * (f.log_weights - 0.5 * (np.log(det) + n * LOG_2PI))
             only = np.where(np.arange(len(A[0, 0]))[:, None] == 0, 0.0, -np.inf)
             log_weights = np.where(w > 0.0, np.where(f.log_weights > -np.inf, log_weights, -np.inf), only)
@@ -288,7 +288,7 @@ def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
             if i:
                 y += linalg.matvec(np.broadcast_to(A, information.shape), x - first)
         P, det, _ = linalg.sweep(information)
-        bad |= (_condition(information, P) & (log_weights > -np.inf)).reshape(-1, B).any(axis=0)
+        bad |= (_beyond(information, P) & (log_weights > -np.inf)).reshape(-1, B).any(axis=0)
         offset = linalg.matvec(P, y)
         log_weights += 0.5 * (n * LOG_2PI - np.log(det))
         for _, x, A in factors:
@@ -298,9 +298,7 @@ def power_product(sources: Sequence[Mixtures], powers: FloatArray) -> Mixtures:
     return Mixtures(log_weights.reshape(-1, B), (first + offset).reshape(n, -1, B), P.reshape(n, n, -1, B))
 
 
-def _condition(P: FloatArray, A: FloatArray) -> NDArray[np.bool_]:
+def _beyond(P: Floats, A: Floats) -> Bools:
     """Where (...) P with inverse A is beyond `CONDITION`, or no covariance."""
-    worst = P[0, 0] * A[0, 0]
-    for k in range(1, len(P)):
-        worst = np.maximum(worst, P[k, k] * A[k, k])
+    worst = linalg.condition(P, A)
     return np.asarray(~((worst <= CONDITION) & (worst >= 0.5)))

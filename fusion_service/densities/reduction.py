@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 from fusion_service.densities.mixture import DensityError, Mixture, Mixtures, log_sum
-from fusion_service.linalg import FloatArray, total
+from fusion_service.linalg import total
 
 __all__ = ["reduce_mixture", "reduce_mixtures"]
 
 METHODS = ("runnalls", "salmond", "truncate")
 
 
-def merged(
-    a: tuple[FloatArray, FloatArray, FloatArray], b: tuple[FloatArray, FloatArray, FloatArray]
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+def merged(a: tuple[Floats, Floats, Floats], b: tuple[Floats, Floats, Floats]) -> tuple[Floats, Floats, Floats]:
     """Weight, mean and covariance of two weighted Gaussians, batch-last, merged with their moments kept."""
     weight = a[0] + b[0]
     share = b[0] / weight
@@ -47,7 +46,7 @@ def reduce_mixture(
 def reduce_mixtures(
     mixtures: Mixtures, *, max_components: int | None = None, prune: float = 0.0, method: str = "runnalls"
 ) -> Mixtures:
-    """`reduce_mixture` of many at once."""
+    """`reduce_mixture` of many at once. Raises DensityError for a method or limits that are none."""
     if method not in METHODS:
         raise DensityError(f"method {method!r}: one of {', '.join(METHODS)}")
     if max_components is not None and max_components < 1:
@@ -81,29 +80,24 @@ def reduce_mixtures(
         return Mixtures(np.log(w) + log_mass, x, P)
 
 
-def _merge(
-    weights: FloatArray, means: FloatArray, P: FloatArray, count: NDArray[np.intp], most: int, method: str
-) -> None:
-    """Merge in place down to `most` components; what is merged away keeps weight 0.
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    """Components of B mixtures that are merged in place; what is merged away keeps weight 0."""
 
-    For every component its cheapest partner is kept, and looked for again only where it was merged.
-    """
-    C, B = weights.shape
-    todo = np.flatnonzero(count > most)
-    left = count[todo]
-    logdet = linalg.logdet(P)
-    whole = linalg.inverse(Mixtures(np.log(weights), means, P).moments()[1]) if method == "salmond" else P[:, :, 0]
-    cost = np.full((C, C, B), np.inf)
-    everyone = slice(None)
+    weights: Floats  # (C, B)
+    means: Floats  # (n, C, B)
+    covariances: Floats  # (n, n, C, B)
+    logdet: Floats  # (C, B)
+    whole: Floats | None  # (n, n, B), the inverse covariances of the mixtures, for Salmond's cost
 
-    def costs(i: Any, own: Any, at: Any, js: slice) -> FloatArray:
+    def costs(self, i: Any, own: Any, at: Any, js: slice) -> Floats:
         """Of merging component i of the elements `own` with those in `js`; `at` is `own`, faster."""
-        w, other = weights[i, own], weights[js, at]
-        d = means[:, js, at] - means[:, i, own][:, None]
-        if method == "salmond":
-            out = w * other / (w + other) * total(d * linalg.matvec(whole[:, :, None, at], d))
+        w, other = self.weights[i, own], self.weights[js, at]
+        d = self.means[:, js, at] - self.means[:, i, own][:, None]
+        if self.whole is not None:
+            out = w * other / (w + other) * total(d * linalg.matvec(self.whole[:, :, None, at], d))
         else:
-            S, mine = P[:, :, js, at], P[:, :, i, own]
+            S, mine = self.covariances[:, :, js, at], self.covariances[:, :, i, own]
             share = other / (w + other)
             both = share * (1.0 - share)
             M = np.empty_like(S)
@@ -111,29 +105,46 @@ def _merge(
                 M[k, : k + 1] = (
                     share * S[k, : k + 1] + (1.0 - share) * mine[k, : k + 1, None] + both * d[k] * d[: k + 1]
                 )
-            out = 0.5 * ((w + other) * linalg.logdet(M) - w * logdet[i, own] - other * logdet[js, at])
+            out = 0.5 * ((w + other) * linalg.logdet(M) - w * self.logdet[i, own] - other * self.logdet[js, at])
         return np.where((w > 0.0) & (other > 0.0), out, np.inf)
 
+    def join(self, i: Ints, j: Ints, at: Ints) -> None:
+        """Merge component j of each of the elements `at` into component i."""
+        w, x, P = self.weights, self.means, self.covariances
+        w[i, at], x[:, i, at], P[:, :, i, at] = merged(
+            (w[i, at], x[:, i, at], P[:, :, i, at]), (w[j, at], x[:, j, at], P[:, :, j, at])
+        )
+        w[j, at] = 0.0
+        self.logdet[i, at] = linalg.logdet(P[:, :, i, at])
+
+
+def _merge(weights: Floats, means: Floats, P: Floats, count: Ints, most: int, method: str) -> None:
+    """Merge in place down to `most` components; what is merged away keeps weight 0.
+
+    For every component its cheapest partner is kept, and looked for again only where it was merged.
+    """
+    C, B = weights.shape
+    todo = np.flatnonzero(count > most)
+    left = count[todo]
+    whole = linalg.inverse(Mixtures(np.log(weights), means, P).moments()[1]) if method == "salmond" else None
+    parts = _Parts(weights, means, P, linalg.logdet(P), whole)
+    cost = np.full((C, C, B), np.inf)
+    everyone = slice(None)
     for i in range(C - 1):
-        cost[i, i + 1 :] = cost[i + 1 :, i] = costs(i, everyone, everyone, slice(i + 1, C))
+        cost[i, i + 1 :] = cost[i + 1 :, i] = parts.costs(i, everyone, everyone, slice(i + 1, C))
     partner = cost.argmin(axis=1)
     low = np.take_along_axis(cost, partner[:, None], axis=1)[:, 0]
     while len(todo):
         i = low[:, todo].argmin(axis=0)
         j = partner[i, todo]
         i, j = np.minimum(i, j), np.maximum(i, j)
-        weights[i, todo], means[:, i, todo], P[:, :, i, todo] = merged(
-            (weights[i, todo], means[:, i, todo], P[:, :, i, todo]),
-            (weights[j, todo], means[:, j, todo], P[:, :, j, todo]),
-        )
-        weights[j, todo] = 0.0
-        logdet[i, todo] = linalg.logdet(P[:, :, i, todo])
+        parts.join(i, j, todo)
         cost[j, :, todo] = cost[:, j, todo] = np.inf
         low[j, todo] = np.inf
         left -= 1
         go = left > most
         todo, left, i, j = todo[go], left[go], i[go], j[go]
-        new = costs(i, todo, everyone if len(todo) == B else todo, slice(0, C))
+        new = parts.costs(i, todo, everyone if len(todo) == B else todo, slice(0, C))
         new[i, np.arange(len(todo))] = np.inf
         cost[i, :, todo] = new.T
         cost[:, i, todo] = new

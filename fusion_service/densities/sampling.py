@@ -10,12 +10,12 @@ from collections.abc import Callable
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 
 __all__ = ["draws", "halved_sum", "sampled_moments"]
 
 
-def draws(n: int, samples: int, seed: int) -> FloatArray:
+def draws(n: int, samples: int, seed: int) -> Floats:
     """About `samples` seeded standard normal vectors (n, S), S even, in pairs z and -z, with exactly unit covariance.
 
     So the mean and the covariance of a Gaussian come out exactly, and the error of other moments is smaller.
@@ -27,8 +27,8 @@ def draws(n: int, samples: int, seed: int) -> FloatArray:
 
 
 def sampled_moments(
-    means: FloatArray, covariances: FloatArray, log_ratio: Callable[[FloatArray], FloatArray], z: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    means: Floats, covariances: Floats, log_ratio: Callable[[Floats], Floats], z: Floats
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Log mass (B,), mean (n, B) and covariance (n, n, B) of exp(log_ratio(x)) N(x; means, covariances).
 
     And the number of effective samples (B,). Importance sampling from the Gaussians (n, B), (n, n, B) themselves at
@@ -52,7 +52,7 @@ def sampled_moments(
         return top + np.log(mass / S), means + mean, covariance, mass * mass / halved_sum(w * w)
 
 
-def halved_sum(a: FloatArray) -> FloatArray:
+def halved_sum(a: Floats) -> Floats:
     """Sum over the first axis by halves, in an order that does not depend on the batch."""
     while len(a) > 1:
         odd, half = len(a) % 2, len(a) // 2
@@ -60,5 +60,5 @@ def halved_sum(a: FloatArray) -> FloatArray:
         if odd:
             b[0] += a[-1]
         a = b
-    out: FloatArray = a[0]
+    out: Floats = a[0]
     return out

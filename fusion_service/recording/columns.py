@@ -18,7 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 
 __all__ = [
     "ColumnWriter",
@@ -72,8 +72,8 @@ class Points:
     """T points of one row: plane (T, 2) as Rerun draws it, east and -north in m; geo (T, 2) latitude and longitude
     in degrees, None in a frame without a place on Earth; classes (T,) of the entity's annotation context."""
 
-    plane: FloatArray
-    geo: FloatArray | None
+    plane: Floats
+    geo: Floats | None
     labels: list[str] | None = None
     classes: Classes | None = None
 
@@ -83,11 +83,11 @@ class Lines:
     """S line strips of one row, one after the other: plane (P, 2) and geo (P, 2) as in `Points`; lengths (S,);
     classes (S,) on the plane, widths (S,) in points of the screen, None for the entity's own."""
 
-    plane: FloatArray
-    geo: FloatArray | None
+    plane: Floats
+    geo: Floats | None
     lengths: NDArray[np.int64]
     classes: Classes | None = None
-    widths: FloatArray | None = None
+    widths: Floats | None = None
 
 
 Build = Callable[[Any, Sequence[Any]], list[Any]]
@@ -256,7 +256,7 @@ def _lines(rr: Any, rows: Sequence[Lines]) -> list[Any]:
     lengths = [len(row.lengths) for row in rows]
     offsets = np.concatenate([[0], *(row.lengths for row in rows)]).cumsum().astype(np.int32)
 
-    def strips(points: Sequence[FloatArray | None], kind: Any, batch: Any) -> Any:
+    def strips(points: Sequence[Floats | None], kind: Any, batch: Any) -> Any:
         flat = pa.array(np.concatenate([part for part in points if part is not None]).ravel(), type=kind)
         pairs = pa.FixedSizeListArray.from_arrays(flat, type=batch([])._ARROW_DATATYPE.value_type)
         return pa.ListArray.from_arrays(pa.array(offsets), pairs, type=batch([])._ARROW_DATATYPE)

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fusion_service.arrays import Floats
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
 from fusion_service.geodesy import ecef_to_geodetic, enu_to_geodetic
-from fusion_service.linalg import FloatArray
 from fusion_service.recording import read
 from schemas import (
     COMPONENTS,
@@ -166,7 +166,7 @@ def _contributors(message: Exportable) -> list[str]:
     return [" ".join(sorted(set(names[begin:end]))) for begin, end in pairwise([0, *ends])]
 
 
-def _places(message: Exportable, means: FloatArray) -> FloatArray | None:
+def _places(message: Exportable, means: Floats) -> Floats | None:
     """Latitude, longitude (degrees) and altitude (m), (3, T); None in a frame without a place on Earth. A state without
     z lies `height` (0 unless the source says one) above the ellipsoid."""
     xyz = [means[:, message.space.index(name)] if name in message.space else None for name in "xyz"]

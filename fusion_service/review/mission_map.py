@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.colours import PAPER_FUSED, PAPER_TRUTH, source_colours
 from fusion_service.geodesy import FrameError, ecef_to_geodetic, transform
-from fusion_service.linalg import FloatArray
 from fusion_service.recording.drawing.geometry import QUANTILE, circle, outline
 from fusion_service.review.snapshots import in_frame, order, truth_path, truth_positions
 from schemas import Ecef, Enu, Frame, GlobalTracks, LocalTracks, Message, SensorInfo, Truth, check_numbers
@@ -80,23 +80,23 @@ class _Track(NamedTuple):
     """One track over time: times (L,) ns, positions (L, 2) and their covariances (L, 2, 2)."""
 
     times: NDArray[np.int64]
-    xy: FloatArray
-    covariances: FloatArray
+    xy: Floats
+    covariances: Floats
 
 
 class _Mission(NamedTuple):
     """All that is drawn, in one ENU or local frame; positions in m."""
 
     frame: Frame
-    truth: dict[int, tuple[NDArray[np.int64], FloatArray]]
+    truth: dict[int, tuple[NDArray[np.int64], Floats]]
     local: dict[str, list[_Track]]
     fused: list[_Track]
     infos: dict[str, SensorInfo]
-    sensors: dict[str, FloatArray]
+    sensors: dict[str, Floats]
     colours: dict[str, str]
     hidden: list[str]
 
-    def places(self) -> FloatArray:
+    def places(self) -> Floats:
         tracks = [track.xy for one in (*self.local.values(), self.fused) for track in one]
         return np.concatenate([*tracks, *(xy for _, xy in self.truth.values()), *self.sensors.values()])
 
@@ -126,7 +126,7 @@ def _gather(messages: Iterable[Message], frame: Frame | None) -> _Mission:
         raise ValueError("nothing to draw: no track, truth or sensor")
     frame = _level(frame or located[0].frame, located)
     tracks: dict[str, list[_Track]] = {}
-    sensors: dict[str, FloatArray] = {}
+    sensors: dict[str, Floats] = {}
     hidden: list[str] = []
     for name, scans in sorted(local.items()):
         try:
@@ -169,7 +169,7 @@ def _level(frame: Frame, located: Sequence[LocalTracks | GlobalTracks | Truth | 
     raise ValueError("nothing to draw: no place in ECEF, the frame of the map")
 
 
-def _moved(places: FloatArray, source: Frame, target: Frame) -> FloatArray:
+def _moved(places: Floats, source: Frame, target: Frame) -> Floats:
     """Positions (T, 3) -> (T, 2)."""
     return transform(places, np.zeros((len(places), 3, 3)), ("x", "y", "z"), source, target)[0][:, :2]
 
@@ -177,7 +177,7 @@ def _moved(places: FloatArray, source: Frame, target: Frame) -> FloatArray:
 def _tracks(messages: Sequence[LocalTracks | GlobalTracks], frame: Frame) -> list[_Track]:
     """The tracks of one source, or of the centre without its tentative ones, in the order of their keys."""
     messages = sorted(messages, key=order)
-    rows: dict[tuple[str, int, int], list[tuple[int, FloatArray, FloatArray]]] = {}
+    rows: dict[tuple[str, int, int], list[tuple[int, Floats, Floats]]] = {}
     for space, indices, means, covariances in in_frame(messages, frame):
         at = [space.index("x"), space.index("y")]
         xy, P = means[:, at], covariances[:, at][:, :, at]
@@ -199,7 +199,7 @@ def _tracks(messages: Sequence[LocalTracks | GlobalTracks], frame: Frame) -> lis
     return found
 
 
-def _bounds(places: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _bounds(places: Floats) -> tuple[Floats, Floats]:
     """Corners of the map: all places with a margin, and not too narrow a strip."""
     low, high = places.min(axis=0), places.max(axis=0)
     middle, half = (low + high) / 2, (high - low) / 2
@@ -207,7 +207,7 @@ def _bounds(places: FloatArray) -> tuple[FloatArray, FloatArray]:
     return middle - half, middle + half
 
 
-def _semi_axes(tracks: Sequence[_Track]) -> FloatArray:
+def _semi_axes(tracks: Sequence[_Track]) -> Floats:
     """Larger semi-axes of all 95 % ellipses, m."""
     spreads = np.concatenate([track.covariances for track in tracks] or [np.zeros((0, 2, 2))])
     return np.sqrt(QUANTILE * np.linalg.eigvalsh(spreads)[:, 1])
@@ -240,7 +240,7 @@ def _draw_sensor(axes: Axes, name: str, info: SensorInfo, mission: _Mission, met
 
 def _name_sensors(axes: Axes, mission: _Mission, metres: float, width: float) -> None:
     """The names of sensors that stand together, within a hundredth of the map's width, on one line."""
-    together: list[tuple[FloatArray, list[str]]] = []
+    together: list[tuple[Floats, list[str]]] = []
     for name, (place,) in mission.sensors.items():
         near = (names for at, names in together if math.dist(at, place) < width / 100)
         names = next(near, None)
@@ -272,7 +272,7 @@ def _draw_tracks(axes: Axes, mission: _Mission, metres: float, when: set[int] | 
     axes.add_collection(LineCollection(rings, colors=PAPER_FUSED, lw=0.9, zorder=5))
 
 
-def _rings(tracks: Sequence[_Track], when: set[int] | None, scale: float = 1.0) -> list[FloatArray]:
+def _rings(tracks: Sequence[_Track], when: set[int] | None, scale: float = 1.0) -> list[Floats]:
     """95 % ellipses (points, 2), m, of the tracks at the times in `when`, None for all."""
     return [
         xy + scale * math.sqrt(QUANTILE) * RING @ np.linalg.cholesky(P).T
@@ -320,10 +320,10 @@ def _draw_detail(axes: Axes, mission: _Mission, target: int) -> None:
     axes.tick_params(labelsize=8)
 
 
-def _within(mission: _Mission, low: FloatArray, high: FloatArray) -> _Mission:
+def _within(mission: _Mission, low: Floats, high: Floats) -> _Mission:
     """Of the paths and tracks those whose bounding boxes meet the box from `low` to `high`."""
 
-    def meets(xy: FloatArray) -> bool:
+    def meets(xy: Floats) -> bool:
         return bool((xy.min(axis=0) <= high).all() and (xy.max(axis=0) >= low).all())
 
     return mission._replace(

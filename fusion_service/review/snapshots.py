@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.densities import moments
 from fusion_service.geodesy import FrameError, transform
-from fusion_service.linalg import FloatArray
 from fusion_service.motion import predict
 from schemas import Frame, GlobalTracks, LocalTracks, Motion, Truth, check_numbers
 from schemas.messages import TENTATIVE
@@ -52,14 +52,14 @@ def order(message: TrackMessage | Truth) -> tuple[int, int, int]:
 
 def truth_path(
     truths: Sequence[Truth], frame: Frame, axes: tuple[str, ...], more: tuple[str, ...] = ()
-) -> dict[int, tuple[Times, FloatArray]]:
+) -> dict[int, tuple[Times, Floats]]:
     """Object id -> its times (L,), ascending, and positions (L, d) in `frame`; the later message of equal times.
 
     more: further components, which are NaN where truth does not say them. Raises ValueError where truth lacks an axis,
     `FrameError` where its frame has no relation to `frame`.
     """
     truths = sorted((truth for truth in truths if len(truth.ids)), key=order)
-    moved: list[FloatArray] = []
+    moved: list[Floats] = []
     for truth in truths:
         own = tuple(name for name in (*"xyz", *more) if name in truth.space)
         if not set(axes) <= set(own):
@@ -84,9 +84,7 @@ def truth_path(
     return {int(ids[begin]): (when[begin:end], places[begin:end]) for begin, end in pairwise([*begins, len(ids)])}
 
 
-def _movable(
-    own: tuple[str, ...], means: FloatArray, source: Frame, target: Frame
-) -> tuple[tuple[str, ...], FloatArray]:
+def _movable(own: tuple[str, ...], means: Floats, source: Frame, target: Frame) -> tuple[tuple[str, ...], Floats]:
     """States in another frame; without their derivatives where these cannot be moved."""
     try:
         return own, transform(means, np.zeros((*means.shape, len(own))), own, source, target)[0]
@@ -97,7 +95,7 @@ def _movable(
         return short, transform(means[:, at], still, short, source, target)[0]
 
 
-def truth_positions(known: Times, path: FloatArray, times: Times, gap: float) -> FloatArray:
+def truth_positions(known: Times, path: Floats, times: Times, gap: float) -> Floats:
     """Positions (K, d) of one object at `times`, linear between `known` (L,), `path` (L, d).
 
     NaN before the first and after the last, and inside a gap longer than `gap` seconds and than `TRUTH_GAPS`
@@ -123,8 +121,8 @@ class Block(NamedTuple):
 
     ends: Indices
     number: Indices
-    states: FloatArray
-    covariances: FloatArray
+    states: Floats
+    covariances: Floats
 
 
 class _Part(NamedTuple):
@@ -133,8 +131,8 @@ class _Part(NamedTuple):
     message: TrackMessage
     space: tuple[str, ...]
     number: Indices
-    means: FloatArray
-    covariances: FloatArray
+    means: Floats
+    covariances: Floats
 
     def select(self, kept: NDArray[np.bool_]) -> _Part:
         return self._replace(number=self.number[kept], means=self.means[kept], covariances=self.covariances[kept])
@@ -269,7 +267,7 @@ class ShownTracks:
 
 def in_frame(
     messages: Sequence[TrackMessage], frame: Frame
-) -> Iterator[tuple[tuple[str, ...], list[int], FloatArray, FloatArray]]:
+) -> Iterator[tuple[tuple[str, ...], list[int], Floats, Floats]]:
     """All tracks in `frame`, mixtures as their mean and covariance, for each state space that occurs:
     the space, the indices of its messages, and their tracks one after another, means (R, n), covariances (R, n, n).
 

@@ -1,15 +1,31 @@
-"""Fusion rules: several Gaussian estimates of one state, whose errors may be correlated, become one.
+"""Fusion rules: several estimates of one state, whose errors may be correlated, become one.
 
 `fuse` checks its input and takes any batch shape; `fuse_last` trusts it, batch-last. `RULES` tells what
 each rule is and what it promises.
 
     fused = fuse("ci", means, covariances, criterion="det")
     fused.mean, fused.covariance, fused.weights
+
+A rule is one file here that declares `RULE = Rule(...)` (`base.rule`); nothing else needs to know of it. What rules
+share stands in `base`, the searches for weights in `weights`, rules for mixtures in `mixtures`, what callers see in
+`face`. `python -m fusion_service.rules` writes the tables of README.md and docs/rules.md anew.
 """
 
-from fusion_service.rules.face import Fused, fuse, fuse_last
-from fusion_service.rules.mixtures import fuse_mixtures
-from fusion_service.rules.options import RuleError
-from fusion_service.rules.registry import RULES, Rule
+from fusion_service.rules.base.options import RuleError
+from fusion_service.rules.base.rule import MixtureRule, Option, Rule
+from fusion_service.rules.face.gaussians import Fused, fuse, fuse_last
+from fusion_service.rules.face.registry import RULES
+from fusion_service.rules.mixtures import MIXTURE_RULES, fuse_mixtures
 
-__all__ = ["RULES", "Fused", "Rule", "RuleError", "fuse", "fuse_last", "fuse_mixtures"]
+__all__ = [
+    "MIXTURE_RULES",
+    "RULES",
+    "Fused",
+    "MixtureRule",
+    "Option",
+    "Rule",
+    "RuleError",
+    "fuse",
+    "fuse_last",
+    "fuse_mixtures",
+]

@@ -197,13 +197,13 @@ def test_the_frame_is_that_of_the_first_sound_track() -> None:
 
 def test_partial_scans_of_many_tracks_are_taken_together_and_as_one_by_one() -> None:
     states = truth(30)
-    pictures = []
-    for together in (True, False):
+    pictures: list[schemas.GlobalTracks] = []
+    for at_once in (True, False):
         made = centre(("r1",))
         for k in range(30):
             give(made, tracks("r1", 1 + k / 100, states[k : k + 1], [k + 1], seq=k, complete=False))
             give(made, tracks("r1", 1.5 + k / 100, states[k : k + 1] + 1.0, [k + 1], seq=100 + k, complete=False))
-            if not together:
+            if not at_once:
                 step(made, 1.5 + k / 100)
         pictures.append(step(made, 2).tracks)
     together, apart = pictures

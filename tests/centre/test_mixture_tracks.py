@@ -71,7 +71,7 @@ def test_one_source_alone_keeps_its_components_and_predicts_each() -> None:
 
 @pytest.mark.parametrize("rule", ["aa", "gm-ga", "cu-modes", "hmd-s"])
 def test_several_sources_are_fused_as_the_rule_fuses_their_mixtures(rule: str) -> None:
-    options = {"samples": 500, "seed": 3} if rule == "hmd-s" else {}
+    options: dict[str, Any] = {"samples": 500, "seed": 3} if rule == "hmd-s" else {}
     mixtures = [some(1, 2, 1)[0], some(1, 3, 2)[0]]
     made = centre(SOURCES, mixture_rule=rule, mixture_options=options, max_components=20)
     for name, mixture in zip(SOURCES, mixtures, strict=True):

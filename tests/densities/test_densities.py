@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.stats import multivariate_normal, norm
 
+from fusion_service.arrays import Floats
 from fusion_service.densities import (
     DensityError,
     Mixture,
@@ -22,8 +24,6 @@ from fusion_service.densities import (
 )
 from tests.helpers.strategies import covariance, dimensions, seeds
 
-Array = NDArray[np.float64]
-
 GM1 = Mixture([0.7, 0.6, 0.5], [[10.0], [50.0], [90.0]], [[[100.0]], [[100.0]], [[200.0]]])
 GM2 = Mixture([0.9, 0.8], [[11.0], [52.0]], [[[100.0]], [[120.0]]])
 """Li-2nd 5.2, Fig. 7."""
@@ -34,7 +34,7 @@ def random_mixture(rng: np.random.Generator, C: int, n: int, spread: float = 3.0
     return Mixture(rng.uniform(0.1, 1.0, C), spread * rng.normal(size=(C, n)), P)
 
 
-def reference_pdf(m: Mixture, x: Array) -> Array:
+def reference_pdf(m: Mixture, x: Floats) -> Floats:
     parts = zip(m.weights, m.means, m.covariances, strict=True)
     return np.asarray(sum(w * multivariate_normal(mean, P).pdf(x) for w, mean, P in parts))
 
@@ -157,7 +157,7 @@ def test_li_2nd_figure_7() -> None:
     assert product.pdf(grid[:, None]).sum() * step == pytest.approx(product.mass, rel=1e-6)
 
 
-def merge_by_hand(m: Mixture, most: int, method: str) -> list[tuple[float, Array, Array]]:
+def merge_by_hand(m: Mixture, most: int, method: str) -> list[tuple[float, Floats, Floats]]:
     """Greedy merging, one pair after the other, as a script would do it."""
     parts = [(float(w), x, P) for w, x, P in zip(m.weights / m.mass, m.means, m.covariances, strict=True)]
     while len(parts) > most:
@@ -180,7 +180,7 @@ def merge_by_hand(m: Mixture, most: int, method: str) -> list[tuple[float, Array
     return sorted(parts, key=lambda p: -p[0])
 
 
-def moments_by_hand(parts: list[tuple[float, Array, Array]]) -> tuple[float, Array, Array]:
+def moments_by_hand(parts: list[tuple[float, Floats, Floats]]) -> tuple[float, Floats, Floats]:
     w = sum(p[0] for p in parts)
     mean = np.asarray(sum(p[0] * p[1] for p in parts)) / w
     P = np.asarray(sum(p[0] * (p[2] + np.outer(p[1] - mean, p[1] - mean)) for p in parts)) / w
@@ -219,13 +219,14 @@ def test_pruning_and_truncating() -> None:
     two = reduce_mixture(m, max_components=2, method="truncate")
     np.testing.assert_allclose(two.weights, [0.625, 0.375])
     assert len(reduce_mixture(Mixture([1.0, 1.0], m.means[:2], m.covariances[:2]), prune=0.9).weights) == 1
-    for options, complaint in (
+    cases: tuple[tuple[dict[str, Any], str], ...] = (
         ({"method": "best"}, "runnalls"),
         ({"max_components": 0}, "at least 1"),
         ({"prune": 1.0}, "share"),
-    ):
+    )
+    for options, complaint in cases:
         with pytest.raises(DensityError, match=complaint):
-            reduce_mixture(m, **options)  # type: ignore[arg-type]
+            reduce_mixture(m, **options)
 
 
 @pytest.mark.parametrize("method", ["runnalls", "salmond", "truncate"])

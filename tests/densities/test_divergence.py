@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from hypothesis import given, settings
-from numpy.typing import NDArray
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import binom
 
+from fusion_service.arrays import Floats
 from fusion_service.densities import (
     Mixture,
     Mixtures,
@@ -21,7 +21,6 @@ from fusion_service.densities import (
 )
 from tests.helpers.strategies import dimensions, seeds, sources
 
-Array = NDArray[np.float64]
 GRID = np.linspace(-25.0, 25.0, 20_001)
 STEP = GRID[1] - GRID[0]
 
@@ -50,7 +49,7 @@ def test_divergence_of_gaussians_on_a_grid() -> None:
     assert ours[0] == pytest.approx(kl_on_grid(f, g), abs=1e-6)
 
 
-def log_z(w: Array, x: Array, P: Array) -> float:
+def log_z(w: Floats, x: Floats, P: Floats) -> float:
     """log of the integral of the weighted geometric mean of Gaussians (Uney (25), corrected)."""
     A = np.linalg.inv(P)
     M = np.einsum("i,ijk->jk", w, A)
@@ -120,7 +119,7 @@ def test_more_gaussians_against_a_minimiser(seed: int) -> None:
     assert log_z(again, x[order], P[order]) == pytest.approx(log_z(w, x, P), abs=1e-8)
 
 
-def uney(kappa: float) -> tuple[Array, Array]:
+def uney(kappa: float) -> tuple[Floats, Floats]:
     """Uney's example 3.3: two Gaussians seen from different aspects, (N, n) and (N, n, n)."""
     turn = np.array([[1.0, -1.0], [1.0, 1.0]]) / np.sqrt(2.0)
     S = np.diag([1.0, 1.0 / kappa])
@@ -173,7 +172,7 @@ def test_mixtures_against_a_grid(N: int) -> None:
     logs = np.stack([m.log_pdf(GRID[:, None]) for m in mixtures])
     w = chernoff_mixtures([Mixtures.of([m]) for m in mixtures], 8000, 1)[:, 0]
 
-    def z(v: Array) -> float:
+    def z(v: Floats) -> float:
         return float(np.log(np.exp(v @ logs).sum() * STEP))
 
     best = minimize(

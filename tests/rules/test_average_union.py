@@ -4,15 +4,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.stats import multivariate_normal
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import RuleError, fuse
 from tests.helpers.strategies import sources
-from tests.rules.test_intersection import gains_of, worst_ratio
+from tests.rules.correlation import gains_of, worst_ratio
 
-Array = NDArray[np.float64]
 SEED = 2009
 
 
@@ -84,12 +83,12 @@ def test_aa_has_the_moments_of_the_mixture(n: int) -> None:
     np.testing.assert_array_equal(fuse("aa", x, P).weights, np.full(3, 1 / 3))
 
 
-def merged(x: Array, P: Array, w: Array) -> tuple[Array, Array]:
+def merged(x: Floats, P: Floats, w: Floats) -> tuple[Floats, Floats]:
     m = w @ x
     return m, np.asarray(np.einsum("i,ijk->jk", w, P) + ((x - m).T * w) @ (x - m))
 
 
-def divergences(x: Array, P: Array, w: Array) -> Array:
+def divergences(x: Floats, P: Floats, w: Floats) -> Floats:
     """KL(p_i, merged average), as Li-AA prints it."""
     m, S = merged(x, P, w)
     A = np.linalg.inv(S)
@@ -113,7 +112,7 @@ def test_diversity_weights_solve_40(N: int, n: int) -> None:
         x, P = sources(rng, N, n)
         fused = fuse("aa", x, P, criterion="diversity")
 
-        def f(w: Array) -> float:
+        def f(w: Floats) -> float:
             return -float(w @ divergences(x, P, w))  # noqa: B023
 
         assert f(fused.weights) <= lowest(f, N) + 1e-7
@@ -131,7 +130,7 @@ def test_bound_weights_solve_45(N: int, n: int) -> None:
         x, P = sources(rng, N, n)
         z = np.array([[multivariate_normal(x[j], P[i] + P[j]).pdf(x[i]) for j in range(N)] for i in range(N)])
 
-        def f(w: Array) -> float:
+        def f(w: Floats) -> float:
             return float(w @ np.log(np.sqrt(np.linalg.det(P)) * (z @ w)))  # noqa: B023
 
         w = fuse("aa", x, P, criterion="bound").weights
@@ -143,7 +142,7 @@ def test_bound_weights_solve_45(N: int, n: int) -> None:
 # ------------------------------------------------------------------ covariance union
 
 
-def adjusted(x: Array, P: Array, w: Array) -> Array:
+def adjusted(x: Floats, P: Floats, w: Floats) -> Floats:
     """Li-AA (11)."""
     d = w @ x - x
     return np.asarray(P + d[:, :, None] * d[:, None, :])
@@ -162,12 +161,12 @@ def test_cu_is_the_smallest_bound(N: int, n: int, criterion: str) -> None:
         np.testing.assert_allclose(fused.mean, w @ x, rtol=1e-12, atol=1e-12)
         assert all(np.linalg.eigvalsh(fused.covariance - u).min() >= -1e-12 for u in U)
 
-        def unpack(z: Array) -> Array:
+        def unpack(z: Floats) -> Floats:
             L = np.zeros((n, n))
             L[lower] = z
             return L @ L.T
 
-        def size(S: Array) -> float:
+        def size(S: Floats) -> float:
             return float(np.linalg.slogdet(S)[1] if criterion == "det" else np.log(np.trace(S)))
 
         start = np.linalg.cholesky(U.sum(axis=0))[lower]
@@ -212,9 +211,8 @@ def test_cu_min_and_chain_13() -> None:
     for criterion, size in (("det", np.linalg.det), ("trace", lambda u: np.trace(u, axis1=1, axis2=2))):
         least = fuse("cu", x, P, bound="min", criterion=criterion)
         np.testing.assert_allclose(least.covariance, U[np.argmin(size(U))], rtol=1e-12)
-    low, middle, high = (
-        np.trace(fuse(r, x, P, **o).covariance) for r, o in (("cu", {"bound": "min"}), ("aa", {}), ("cu", {}))
-    )
+    cases: tuple[tuple[str, dict[str, Any]], ...] = (("cu", {"bound": "min"}), ("aa", {}), ("cu", {}))
+    low, middle, high = (np.trace(fuse(rule, x, P, **options).covariance) for rule, options in cases)
     assert low < middle < high
 
 

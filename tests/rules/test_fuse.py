@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import RULES, RuleError, fuse, fuse_last
 from tests.helpers.strategies import sources
 
-Array = NDArray[np.float64]
 SEED = 31
 CASES: list[tuple[str, dict[str, Any]]] = [
     ("naive", {}),
@@ -40,7 +39,7 @@ IDS = [" ".join((rule, *map(str, options.values()))) for rule, options in CASES]
 every_case = pytest.mark.parametrize(("rule", "options"), CASES, ids=IDS)
 
 
-def batch(rng: np.random.Generator, size: int, N: int, n: int, decades: float = 2.0) -> tuple[Array, Array]:
+def batch(rng: np.random.Generator, size: int, N: int, n: int, decades: float = 2.0) -> tuple[Floats, Floats]:
     drawn = [sources(rng, N, n, decades) for _ in range(size)]
     return np.stack([x for x, _ in drawn]), np.stack([P for _, P in drawn])
 
@@ -116,7 +115,7 @@ def test_neither_input_nor_given_weights_are_changed() -> None:
 X, P2 = np.zeros((5, 2, 3)), np.broadcast_to(np.eye(3), (5, 2, 3, 3))
 
 
-def spoiled(index: tuple[int, ...], value: float, a: Array) -> Array:
+def spoiled(index: tuple[int, ...], value: float, a: Floats) -> Floats:
     out = np.array(a)
     out[index] = value
     return out
@@ -171,7 +170,7 @@ def spoiled(index: tuple[int, ...], value: float, a: Array) -> Array:
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_line(
-    rule: str, x: Any, P: Array, options: dict[str, Any], message: str
+    rule: str, x: Any, P: Floats, options: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(RuleError, match=re.escape(message)) as caught:
         fuse(rule, x, P, **options)
@@ -194,7 +193,7 @@ def test_registry() -> None:
 Rational = list[list[Fraction]]
 
 
-def rational(A: Array) -> Rational:
+def rational(A: Floats) -> Rational:
     return [[Fraction(float(v)) for v in row] for row in A]
 
 
@@ -218,7 +217,7 @@ def combine(weights: list[Fraction], terms: list[Rational]) -> Rational:
     return out
 
 
-def exact(rule: str, x: Array, P: Array, w: Array) -> Array:
+def exact(rule: str, x: Floats, P: Floats, w: Floats) -> Floats:
     """The fused covariance of two sources at these weights, exact up to the last conversion."""
     w1, w2 = (Fraction(float(v)) for v in (w if rule != "naive" else (1, 1)))
     Ps = [rational(p) for p in P]
@@ -235,7 +234,7 @@ def exact(rule: str, x: Array, P: Array, w: Array) -> Array:
     return np.array([[float(v) for v in row] for row in invert(M)])
 
 
-def hard_covariance(rng: np.random.Generator, n: int, condition: float, scales: float) -> Array:
+def hard_covariance(rng: np.random.Generator, n: int, condition: float, scales: float) -> Floats:
     q, _ = np.linalg.qr(rng.normal(size=(n, n)))
     P = (q * np.geomspace(1.0, condition, n)) @ q.T
     s = 10.0 ** rng.uniform(-scales / 2, scales / 2, size=n)
@@ -255,7 +254,7 @@ def test_hard_input_is_right_or_refused(rule: str, criterion: str) -> None:
                 P = np.stack([hard_covariance(rng, n, condition, 0.0) * np.outer(shared, shared) for _ in range(2)])
                 P[1] *= 10.0 ** rng.uniform(-size, size)
                 x = rng.normal(size=(2, n)) * np.sqrt(P[0].diagonal())
-                options = {} if rule == "naive" else {"criterion": criterion}
+                options: dict[str, Any] = {} if rule == "naive" else {"criterion": criterion}
                 try:
                     fused = fuse(rule, x, P, **options)
                 except RuleError:

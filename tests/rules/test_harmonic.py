@@ -2,27 +2,26 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import null_space
 from scipy.optimize import minimize, minimize_scalar
 from scipy.stats import multivariate_normal
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import fuse
 from tests.helpers.strategies import sources
 
-Array = NDArray[np.float64]
 SEED = 99
 CRITERIA = ("det", "trace")
 
 
-def cost(criterion: str, G: Array) -> float:
+def cost(criterion: str, G: Floats) -> float:
     """(77): a scalar of the inverse of the mutual component."""
     if criterion == "det":
         return float(-np.linalg.slogdet(G)[1])
     return float(np.log(np.trace(np.linalg.inv(G))))
 
 
-def mutual_by_integration(x: Array, P: Array, w: Array) -> tuple[Array, Array]:
+def mutual_by_integration(x: Floats, P: Floats, w: Floats) -> tuple[Floats, Floats]:
     """Mean and covariance of sum w_j prod_{i != j} p_i, by sums over a grid (n = 1 or 2)."""
     n = x.shape[1]
     axes = [np.linspace(-14, 14, 4001 if n == 1 else 561)] * n
@@ -88,9 +87,9 @@ def test_influence_is_the_gain_of_each_source() -> None:
     c = np.stack([C[j] @ sum(A[i] @ x[i] for i in range(3) if i != j) for j in range(3)])
     r = c - w @ c
     V = np.linalg.inv(np.einsum("i,ijk->jk", w, C) + (r.T * w) @ r)
+    assert base.influence is not None
     for i in range(3):
         K = base.covariance @ (A[i] - V @ sum(w[j] * C[j] for j in range(3) if j != i) @ A[i])
-        assert base.influence is not None
         assert base.influence[i] == pytest.approx(np.trace(K) / 2, rel=1e-9)
     assert base.influence.sum() == pytest.approx(1.0)
 
@@ -120,7 +119,7 @@ def test_weights_of_many_sources_solve_77(criterion: str, constants: bool) -> No
         A = np.linalg.inv(P)
         fused = fuse("hmd-ga", x, P, criterion=criterion, constants=constants)
 
-        def best_inverse(z: Array) -> float:
+        def best_inverse(z: Floats) -> float:
             v = np.exp(z) / np.exp(z).sum()
             C = [np.linalg.inv(A.sum(axis=0) - a) for a in A]  # noqa: B023
             c = np.stack([C[j] @ sum(A[i] @ x[i] for i in range(N) if i != j) for j in range(N)])  # noqa: B023

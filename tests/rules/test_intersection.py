@@ -10,21 +10,22 @@ from numpy.typing import NDArray
 from scipy.linalg import sqrtm
 from scipy.optimize import minimize, minimize_scalar
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import fuse
 from tests.helpers.strategies import covariance, sources
+from tests.rules.correlation import gains_of, worst_ratio
 
-Array = NDArray[np.float64]
 SEED = 4711
 CRITERIA = ("det", "trace")
 
 
-def cost(criterion: str, information: Array) -> float:
+def cost(criterion: str, information: NDArray[Any]) -> float:
     if criterion == "det":
         return float(-np.linalg.slogdet(information)[1])
     return float(np.log(np.trace(np.linalg.inv(information))))
 
 
-def inflation(w: Array, R: Array | float) -> Array:
+def inflation(w: Floats, R: Floats | float) -> Floats:
     """c_i = w_i / (R w)_i, R a matrix or one number for all pairs."""
     if np.ndim(R) == 0:
         R = np.full((len(w), len(w)), R)
@@ -32,13 +33,13 @@ def inflation(w: Array, R: Array | float) -> Array:
     return np.asarray(w / (R @ w))
 
 
-def lowest(f: Callable[[Array], float], N: int) -> float:
+def lowest(f: Callable[[Floats], float], N: int) -> float:
     """Minimum over the simplex, by scipy."""
     if N == 2:
         inside = minimize_scalar(
             lambda t: f(np.array([t, 1 - t])), bounds=(0, 1), method="bounded", options={"xatol": 1e-11}
         )
-        return min(inside.fun, f(np.array([1e-13, 1 - 1e-13])), f(np.array([1 - 1e-13, 1e-13])))
+        return float(min(inside.fun, f(np.array([1e-13, 1 - 1e-13])), f(np.array([1 - 1e-13, 1e-13]))))
     best = np.inf
     for start in (np.zeros(N), *(4.0 * np.eye(N))):
         best = min(best, minimize(lambda z: f(np.exp(z) / np.exp(z).sum()), start, options={"gtol": 1e-8}).fun)
@@ -59,7 +60,7 @@ def test_weights_are_the_best(N: int, n: int, criterion: str, rho: float) -> Non
         A = np.linalg.inv(P)
         fused = fuse("ci" if rho == 1.0 else "bci", x, P, **options)
 
-        def f(w: Array) -> float:
+        def f(w: Floats) -> float:
             return cost(criterion, np.einsum("i,ijk->jk", inflation(w, rho), A))  # noqa: B023
 
         assert fused.weights.sum() == pytest.approx(1.0, abs=1e-12)
@@ -111,6 +112,23 @@ def test_bounds_of_zero_and_one_are_naive_and_ci() -> None:
     np.testing.assert_allclose(fuse("bci", x, P, max_correlation=0.0).weights, np.full(3, 1 / 3))
 
 
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_bits_under_a_matrix_of_bounds_are_those_of_the_numbers(criterion: str) -> None:
+    """Not of what stood in memory before: the upper triangle of a derivative was once read and never written."""
+    drawn = [sources(np.random.default_rng(SEED + i), 3, 3) for i in range(40)]
+    x, P = (np.stack(a) for a in zip(*drawn, strict=True))
+    R = np.array([[1.0, 0.8, 0.8], [0.8, 1.0, 0.5], [0.8, 0.5, 1.0]])
+    results = []
+    for junk in (0.0, 1e3, -1.0, np.nan):
+        for size in (40, 9 * 40, 27 * 40):
+            np.full(size, junk)
+        results.append(fuse("bci", x, P, max_correlation=R, criterion=criterion))
+    alone = fuse("bci", x[7], P[7], max_correlation=R, criterion=criterion)
+    for fused in results:
+        np.testing.assert_array_equal(fused.weights, results[0].weights)
+        np.testing.assert_array_equal(fused.weights[7], alone.weights)
+
+
 def test_the_criterion_rises_with_the_bound() -> None:
     x, P = sources(np.random.default_rng(SEED), 3, 3)
     for criterion in CRITERIA:
@@ -151,27 +169,6 @@ def test_different_bounds_per_pair_are_searched_from_several_sides() -> None:
             assert cost(criterion, np.linalg.inv(fused.covariance)) <= best + 1e-2
 
 
-def worst_ratio(P: Array, fused: Array, gains: Array, R: Array) -> float:
-    """Largest u'Eu / u'Fu over directions u and joint covariances within the bounds R, by optimisation over u.
-
-    For one u the worst joint covariance correlates the sources along a_i = P_i^1/2 K_i' u, with exactly
-    R_ij: it is positive semidefinite when R is.
-    """
-    roots = [np.real(sqrtm(p)) @ k.T for p, k in zip(P, gains, strict=True)]
-
-    def ratio(u: Array) -> float:
-        a = np.array([np.linalg.norm(r @ u) for r in roots])
-        return float(a @ R @ a / (u @ fused @ u))
-
-    rng = np.random.default_rng(SEED)
-    starts = rng.normal(size=(12, len(fused)))
-    return max(-minimize(lambda u: -ratio(u / np.linalg.norm(u)), u, method="BFGS").fun for u in starts)
-
-
-def gains_of(P: Array, c: Array, fused: Array) -> Array:
-    return np.stack([c[i] * fused @ np.linalg.inv(P[i]) for i in range(len(P))])
-
-
 @pytest.mark.parametrize("criterion", CRITERIA)
 @pytest.mark.parametrize("N", [2, 3])
 def test_ci_and_bci_bound_the_error_of_every_admissible_correlation(N: int, criterion: str) -> None:
@@ -203,9 +200,9 @@ def test_no_cross_covariance_found_by_brute_force_breaks_the_promise(rho: float)
         half = [np.real(sqrtm(p)) for p in P]
         white = np.linalg.inv(np.linalg.cholesky(fused.covariance))
 
-        def largest(z: Array) -> float:
+        def largest(z: Floats) -> float:
             Z = z.reshape(2, 2)
-            cross = rho * half[0] @ (Z / max(1.0, np.linalg.norm(Z, 2))) @ half[1]  # noqa: B023
+            cross = rho * half[0] @ (Z / max(1.0, float(np.linalg.norm(Z, 2)))) @ half[1]  # noqa: B023
             J = np.block([[P[0], cross], [cross.T, P[1]]])  # noqa: B023
             return float(np.linalg.eigvalsh(white @ K @ J @ K.T @ white.T)[-1])  # noqa: B023
 

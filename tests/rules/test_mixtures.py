@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from scipy.stats import chi2, multivariate_normal
 
+from fusion_service.arrays import Floats
 from fusion_service.densities import Mixture, Mixtures
 from fusion_service.rules import RuleError, fuse
 from fusion_service.rules.mixtures import MIXTURE_RULES, fuse_mixtures, fuse_mixtures_last
 from tests.helpers.strategies import covariance, dimensions, seeds
 
-Array = NDArray[np.float64]
 A, B = np.array([[2.5, -1.0], [-1.0, 1.2]]), np.array([[0.8, -0.5], [-0.5, 4.0]])
 GAUSSIANS = (Mixture([1.0], [[0.5, 1.0]], [A]), Mixture([1.0], [[2.0, 1.0]], [B]))
 PAIR = (Mixture([0.3, 0.7], [[-0.5, 3.0], [2.0, 0.3]], [A, B]), Mixture([0.4, 0.6], [[-1.5, 1.0], [3.0, -4.0]], [A, B]))
@@ -40,12 +39,12 @@ def random_mixture(rng: np.random.Generator, C: int, n: int) -> Mixture:
     return Mixture(rng.dirichlet(np.ones(C)), 1.5 * rng.normal(size=(C, n)), P)
 
 
-def on_grid(m: Mixture) -> Array:
+def on_grid(m: Mixture) -> Floats:
     parts = zip(m.weights, m.means, m.covariances, strict=True)
     return np.asarray(sum(w * multivariate_normal(x, P).pdf(GRID) for w, x, P in parts))
 
 
-def fused_on_grid(rule: str, sources: tuple[Mixture, ...], w: Array) -> Array:
+def fused_on_grid(rule: str, sources: tuple[Mixture, ...], w: Floats) -> Floats:
     """The unnormalised density."""
     f = np.stack([on_grid(m) for m in sources])
     with np.errstate(divide="ignore"):
@@ -161,7 +160,8 @@ def test_li_2nd_figure_7() -> None:
     x = np.linspace(-200.0, 300.0, 20_001)[:, None]
     exact = np.sqrt(GM1.pdf(x) * GM2.pdf(x)).sum() * 0.025
     assert exact == pytest.approx(1.5634, abs=5e-5)
-    for rule, options in (("gm-ga", {"cross_terms": "sampled"}), ("gmd-s", {})):
+    cases: tuple[tuple[str, dict[str, Any]], ...] = (("gm-ga", {"cross_terms": "sampled"}), ("gmd-s", {}))
+    for rule, options in cases:
         fused = fuse_mixtures(rule, [GM1, GM2], weights="uniform", normalise=False, samples=20_000, **options)
         assert fused.mass == pytest.approx(exact, rel=0.01)
     union = fuse_mixtures("aa", [GM1, GM2], normalise=False)
@@ -274,7 +274,7 @@ def test_a_change_of_state_changes_nothing(seed: int, n: int) -> None:
     for rules, T in ((EXACT, rng.normal(size=(n, n)) + 2 * np.eye(n)), (SAMPLED, np.tril(rng.uniform(0.5, 2, (n, n))))):
         b = rng.normal(size=n)
 
-        def moved(m: Mixture, T: Array = T, b: Array = b) -> Mixture:
+        def moved(m: Mixture, T: Floats = T, b: Floats = b) -> Mixture:
             return Mixture(m.weights, m.means @ T.T + b, np.einsum("ij,cjk,lk->cil", T, m.covariances, T))
 
         there = [moved(m) for m in sources]
@@ -323,7 +323,7 @@ def test_blocks_are_joined(monkeypatch: pytest.MonkeyPatch) -> None:
         Mixtures.of([random_mixture(rng, C, 2) for C in counts]) for counts in ((2, 1, 3, 1, 1), (1, 3, 3, 1, 1))
     ]
     whole, w = fuse_mixtures_last("gm-ga", sources)
-    monkeypatch.setattr("fusion_service.rules.mixtures.AT_ONCE", 18)
+    monkeypatch.setattr("fusion_service.rules.mixtures.face.fusing.AT_ONCE", 18)
     parts, v = fuse_mixtures_last("gm-ga", sources)
     np.testing.assert_array_equal(v, w)
     for i in range(5):

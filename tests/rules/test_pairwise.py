@@ -5,21 +5,20 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.linalg import eigh, sqrtm
 from scipy.optimize import minimize, minimize_scalar
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import RuleError, fuse, fuse_last
 from tests.helpers.strategies import covariance, sources
 
-Array = NDArray[np.float64]
 SEED = 2017
 CRITERIA = ("det", "trace")
 PAIR = np.stack([np.diag([4.0, 1.0]), np.diag([1.0, 4.0])])
 """The counter-example's covariances, with E[e1_2 e2_1] = .9 and no other cross-term."""
 
 
-def inverse_ci(x: Array, P: Array, w: Array) -> tuple[Array, Array]:
+def inverse_ci(x: Floats, P: Floats, w: Floats) -> tuple[Floats, Floats]:
     """Sharma (47), with the leading covariance that it lacks."""
     A = np.linalg.inv(P)
     G = w[0] * P[0] + w[1] * P[1]
@@ -27,7 +26,7 @@ def inverse_ci(x: Array, P: Array, w: Array) -> tuple[Array, Array]:
     return fused @ (A[0] @ x[0] + A[1] @ x[1] - np.linalg.solve(G, w @ x)), fused
 
 
-def gains(rule: str, P: Array, **options: Any) -> Array:
+def gains(rule: str, P: Floats, **options: Any) -> Floats:
     """Gains (N, n, n) of a rule that is linear in the means, read off its results."""
     N, n = P.shape[:2]
     units = np.eye(N * n).reshape(N * n, N, n)
@@ -35,7 +34,7 @@ def gains(rule: str, P: Array, **options: Any) -> Array:
     return fused.mean.reshape(N, n, n).swapaxes(1, 2)
 
 
-def worst(fused: Array, K: Array, joint: Array) -> float:
+def worst(fused: Floats, K: Floats, joint: Floats) -> float:
     """Largest eigenvalue of the true error's covariance relative to the reported one."""
     whole = np.hstack(list(K))
     return float(eigh(whole @ joint @ whole.T, fused, eigvals_only=True)[-1])
@@ -49,7 +48,7 @@ def test_ici_weights_are_the_best_and_moments_those_of_the_formula(n: int, crite
         x, P = sources(rng, 2, n, decades)
         fused = fuse("ici", x, P, criterion=criterion)
 
-        def size(S: Array) -> float:
+        def size(S: Floats) -> float:
             return float(np.linalg.slogdet(S)[1] if criterion == "det" else np.log(np.trace(S)))
 
         def f(t: float) -> float:
@@ -75,7 +74,7 @@ def test_ici_pairs_as_fast_as_certified() -> None:
         assert np.linalg.slogdet(det.covariance[b])[1] <= min(values) + 1e-9
 
 
-def common_information(z: Array, P: Array) -> Array:
+def common_information(z: Floats, P: Floats) -> Floats:
     """Some X with 0 <= X <= P_i^-1 for both, at the limit: the information both sources have in common."""
     n = P.shape[1]
     X = z.reshape(n, n) @ z.reshape(n, n).T
@@ -93,7 +92,7 @@ def test_ici_is_conservative_under_its_own_structure(criterion: str) -> None:
             gains("ici", P, criterion=criterion),
         )
 
-        def ratio(z: Array) -> float:
+        def ratio(z: Floats) -> float:
             cross = P[0] @ common_information(z, P) @ P[1]  # noqa: B023
             return worst(fused, K, np.block([[P[0], cross], [cross.T, P[1]]]))  # noqa: B023
 
@@ -146,7 +145,7 @@ def test_ei_shares_where_both_are_equally_good() -> None:
     np.testing.assert_allclose(fused.covariance, np.eye(3), atol=1e-12)
 
 
-def with_correlation(rng: np.random.Generator, n: int, rho: float) -> tuple[Array, Array, Array]:
+def with_correlation(rng: np.random.Generator, n: int, rho: float) -> tuple[Floats, Floats, Floats]:
     x, P = sources(rng, 2, n)
     Z = rng.normal(size=(n, n))
     return x, P, np.real(sqrtm(P[0])) @ (rho * Z / np.linalg.norm(Z, 2)) @ np.real(sqrtm(P[1]))
@@ -197,8 +196,8 @@ def test_more_than_two_are_fused_in_the_stated_order(rule: str, options: dict[st
     P[1] = P[0][::-1, ::-1]  # an equal determinant
     x[3], P[3] = x[2], P[2] * 1.0  # an equal source
     whole = fuse(rule, x, P, influence=True, **options)
-    for order in permutations(range(4)):
-        again = fuse(rule, x[list(order)], P[list(order)], **options)
+    for shuffled in permutations(range(4)):
+        again = fuse(rule, x[list(shuffled)], P[list(shuffled)], **options)
         np.testing.assert_array_equal(again.covariance, whole.covariance)
         np.testing.assert_array_equal(again.mean, whole.mean)
     order = sorted(range(4), key=lambda i: (np.linalg.det(P[i]), *x[i]))
@@ -230,6 +229,7 @@ def test_given_weights_and_influence_of_many(N: int) -> None:
         if N > 2:  # the means decide equal determinants only
             np.testing.assert_allclose(K.sum(axis=0), np.eye(3), atol=1e-8)
         share = fuse(rule, x, P, influence=True).influence
+        assert share is not None
         np.testing.assert_allclose(share, np.trace(K, axis1=1, axis2=2) / 3, atol=1e-7)
 
 

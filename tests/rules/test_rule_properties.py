@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import fuse
 from tests.helpers.strategies import estimates, seeds
 
-Array = NDArray[np.float64]
-Estimates = tuple[Array, Array]
+Estimates = tuple[Floats, Floats]
 ALL: list[tuple[str, dict[str, Any]]] = [
     ("naive", {}),
     ("ci", {}),
@@ -37,7 +36,7 @@ optimal = st.sampled_from([case for case in ALL if case[0] in ("ci", "bci", "hmd
 few = settings(max_examples=60, deadline=None)
 
 
-def close(a: Array, b: Array, P: Array, tolerance: float = 1e-4) -> None:
+def close(a: Floats, b: Floats, P: Floats, tolerance: float = 1e-4) -> None:
     """Means or covariances equal, in units of the smaller standard deviations around."""
     np.testing.assert_allclose(
         a, b, rtol=tolerance, atol=tolerance * np.sqrt(np.linalg.eigvalsh(P).min()) ** np.ndim(a)
@@ -129,7 +128,7 @@ def test_chosen_weights_are_no_worse_than_uniform_or_one_source(
     x, P = drawn
     N = len(x)
 
-    def value(covariance: Array) -> float:
+    def value(covariance: Floats) -> float:
         M = covariance
         if rule == "hmd-ga":
             M = np.linalg.inv(P).sum(axis=0) - np.linalg.inv(covariance)

@@ -2,17 +2,16 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
+from fusion_service.arrays import Floats
 from fusion_service.rules import fuse
 from tests.helpers.strategies import sources
 
-Array = NDArray[np.float64]
 SEED = 74
 
 
-def integrated(rule: str, x: Array, P: Array, w: Array) -> tuple[Array, Array]:
+def integrated(rule: str, x: Floats, P: Floats, w: Floats) -> tuple[Floats, Floats]:
     """Mean and covariance of the fused density by sums over a grid (n = 1 or 2)."""
     n = x.shape[1]
     axes = [np.linspace(-12, 12, 4001 if n == 1 else 401)] * n
@@ -68,6 +67,7 @@ def test_a_result_depends_on_its_own_numbers_and_the_seed(rule: str) -> None:
     P[3] *= 1e-18  # any scale
     x[3] *= 1e-9
     whole = fuse(rule, x, P, samples=1000, seed=5, influence=True)
+    assert whole.influence is not None
     assert np.isnan(whole.influence).all()
     for b in range(5):
         one = fuse(rule, x[b], P[b], samples=1000, seed=5)
@@ -98,10 +98,10 @@ def test_one_source_is_itself_times_alpha() -> None:
 # ------------------------------------------------------------------ KL dispersion
 
 
-def distances(x: Array, P: Array, mean: Array, S: Array) -> Array:
+def distances(x: Floats, P: Floats, mean: Floats, S: Floats) -> Floats:
     """Symmetrised KL divergences, Dubey (27), (29)."""
 
-    def kl(m1: Array, S1: Array, m2: Array, S2: Array) -> float:
+    def kl(m1: Floats, S1: Floats, m2: Floats, S2: Floats) -> float:
         A, d = np.linalg.inv(S2), m1 - m2
         logs = np.linalg.slogdet(S2)[1] - np.linalg.slogdet(S1)[1]
         return float(0.5 * (np.trace(A @ S1) - len(d) + logs + d @ A @ d))
@@ -134,7 +134,7 @@ def test_more_sources_reach_a_local_minimum(N: int, n: int) -> None:
         x, P = sources(rng, N, n)
         fused = fuse("hmd-ga", x, P, criterion="kl")
 
-        def spread(w: Array) -> float:
+        def spread(w: Floats) -> float:
             f = fuse("hmd-ga", x, P, weights=w)  # noqa: B023
             return float(distances(x, P, f.mean, f.covariance).var())  # noqa: B023
 

@@ -80,6 +80,8 @@ def test_a_signal_ends_the_wait_for_a_hub() -> None:
         (["simulate", "three-radars", "--sensor", "radar1", "--realm", "a b"], "bad name 'a b'"),
         (["playback", "autoferry:1", "--sensor", "lidar"], "autoferry:16"),
         (["playback", "autoferry:2", "--sensor", "lidar"], "--data DIR or set FUSION_DATA"),
+        (["playback", "radar", "--sensor", "radar"], "radar-v2x"),
+        (["playback", "radar-v2x", "--sensor", "radar"], "--data DIR or set FUSION_DATA"),
     ],
 )
 def test_bad_usage_is_2_and_says_how_to_mend_it(

@@ -26,7 +26,8 @@ def found() -> dict[str, Record]:
 
 def exact(kind: str) -> tuple[float, float]:
     """ARMSE of a filter whose gains do not depend on the data, from the recursion of its true error covariance."""
-    P = T = MODEL.covariance
+    P: Floats = MODEL.covariance
+    T: Floats = P
     out = []
     for _ in range(MODEL.steps):
         P, T = F @ P @ F.T + Q, F @ T @ F.T + Q
@@ -40,7 +41,7 @@ def exact(kind: str) -> tuple[float, float]:
             local = [P @ H.T @ np.linalg.inv(H @ P @ H.T + V) for V in R]
             information = [np.linalg.inv((np.eye(4) - K @ H) @ P) for K in local]
             w = 1.0 if kind == "nf" else 0.5
-            P = np.linalg.inv(w * (information[0] + information[1]))
+            P = np.linalg.inv(w * (information[0] + information[1])).astype(np.float64)
             share = [w * P @ one for one in information]
             gains, noises = [S @ K for S, K in zip(share, local, strict=True)], R
             keep = sum(S @ (np.eye(4) - K @ H) for S, K in zip(share, local, strict=True))

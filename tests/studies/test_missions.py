@@ -22,14 +22,14 @@ from studies.experiments import sharma_three_radars as radars
 from studies.rules import fuser
 from studies.study import MissingDataError, Result, Run
 
-README = Path(__file__).parents[2] / "README.md"
+PAGE = Path(__file__).parents[2] / "docs" / "measurements.md"
 DATA = data_folder("autoferry")
 needs_data = pytest.mark.skipif(not DATA, reason="FUSION_DATA names no folder of the Autoferry recordings")
 
 
 def table(head: str) -> dict[str, list[float]]:
-    """A table of the README, which `python -m benchmarks.missions` made of missions with all processes."""
-    lines = README.read_text("utf-8").splitlines()
+    """A table of docs/measurements.md, which `python -m benchmarks.missions` made of missions with all processes."""
+    lines = PAGE.read_text("utf-8").splitlines()
     start = next(number for number, line in enumerate(lines) if line.startswith(head))
     rows: dict[str, list[float]] = {}
     for line in lines[start + 2 :]:
@@ -81,9 +81,7 @@ def test_autoferry_scores_as_in_the_running_system() -> None:
 
 
 def test_order_among_equal_times_does_not_matter() -> None:
-    told = [
-        one for one in mission()[0] if isinstance(one, SensorInfo) or one.sent <= radars.three_radars().start + 60e9
-    ]
+    told = [one for one in mission()[0] if isinstance(one, SensorInfo) or one.sent <= three_radars().start + 60e9]
     order = {name: number for number, name in enumerate(("radar3", "radar1", "radar2"))}
     other = sorted(told, key=lambda one: (one.sent, order[one.source]))
     assert [one.source for one in told] != [one.source for one in other]

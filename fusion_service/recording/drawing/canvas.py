@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.recording.columns import ColumnWriter, Lines, Points, Stamp
 from fusion_service.recording.drawing.geometry import CORNERS, Chart, Outline, Place, ellipses
 from fusion_service.recording.drawing.tables import COASTING, LEVELS, Table, hold, levels
@@ -48,7 +48,7 @@ class Canvas:
         self.columns.points(path, stamp, self._points(table.place, labels, levels(table)))
 
     def lines(
-        self, path: str, xy: FloatArray, z: FloatArray, lengths: NDArray[np.int64], stamp: Stamp, *, stands: bool = True
+        self, path: str, xy: Floats, z: Floats, lengths: NDArray[np.int64], stamp: Stamp, *, stands: bool = True
     ) -> None:
         """S strips of `lengths` (S,) one after another: xy (P, 2) m, z (P,) m."""
         self.columns.lines(path, stamp, self._lines(xy, z, lengths), stands=stands)
@@ -88,5 +88,5 @@ class Canvas:
     def _points(self, place: Place, labels: list[str], classes: NDArray[np.uint16] | None = None) -> Points:
         return Points(self.placing.plane(place.xy), self.placing.geo(place.xy, place.z), labels, classes)
 
-    def _lines(self, xy: FloatArray, z: FloatArray, lengths: NDArray[np.int64], **looks: Any) -> Lines:
+    def _lines(self, xy: Floats, z: Floats, lengths: NDArray[np.int64], **looks: Any) -> Lines:
         return Lines(self.placing.plane(xy), self.placing.geo(xy, z), lengths, **looks)

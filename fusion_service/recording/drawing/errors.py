@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, metrics
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.recording.columns import Stamp
 from fusion_service.recording.drawing.geometry import track_moments
 from schemas import STATUSES, GlobalTracks, Truth
@@ -41,8 +41,8 @@ class StepErrors(NamedTuple):
     centre: str
     stamp: Stamp
     ids: NDArray[np.uint64]
-    error: FloatArray
-    nees: FloatArray
+    error: Floats
+    nees: Floats
     dimension: int
     tracks: NDArray[np.uint64]
 
@@ -105,7 +105,7 @@ class TruthMatcher:
         message: GlobalTracks,
         stamp: Stamp,
         ids: NDArray[np.uint64],
-        positions: FloatArray,
+        positions: Floats,
         names: tuple[str, ...],
     ) -> StepErrors:
         index = [message.space.index(name) for name in names]
@@ -128,9 +128,7 @@ class TruthMatcher:
         return StepErrors(message.source, stamp, ids, error, nees, len(names), tracks)
 
 
-def _truth_at(
-    held: list[Truth], message: GlobalTracks
-) -> tuple[NDArray[np.uint64], FloatArray, tuple[str, ...]] | None:
+def _truth_at(held: list[Truth], message: GlobalTracks) -> tuple[NDArray[np.uint64], Floats, tuple[str, ...]] | None:
     """Ids (T,), positions (T, d) in the frame of `message` at its time, and the names of the components; None
     where the truth does not reach around that time."""
     after = bisect_left(held, message.time, key=lambda item: item.time)
@@ -147,7 +145,7 @@ def _truth_at(
     return ids, positions, names
 
 
-def _positions(truth: Truth, message: GlobalTracks) -> tuple[NDArray[np.uint64], FloatArray, tuple[str, ...]]:
+def _positions(truth: Truth, message: GlobalTracks) -> tuple[NDArray[np.uint64], Floats, tuple[str, ...]]:
     own = tuple(name for name in "xyz" if name in truth.space)
     index = [truth.space.index(name) for name in own]
     nothing = np.zeros((len(truth.ids), len(own), len(own)))

@@ -7,14 +7,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from fusion_service.arrays import Floats
 from fusion_service.colours import SCREEN_GRID, SCREEN_TRUTH, packed
-from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import ColumnWriter, import_rerun
 from fusion_service.recording.drawing.geometry import grid
 
 __all__ = ["Corners", "Extent"]
 
-Corners = tuple[FloatArray, FloatArray]
+Corners = tuple[Floats, Floats]
 """South-west and north-east (2,), m."""
 
 
@@ -28,7 +28,7 @@ class Extent:
         self._reached: dict[bool, Corners] = {}
         self.square: Corners | None = None
 
-    def grow(self, xy: FloatArray, *, main: bool) -> bool:
+    def grow(self, xy: Floats, *, main: bool) -> bool:
         """Let it hold `xy` (T, 2), m; whether the grid is another now."""
         if not len(xy):
             return False
@@ -45,7 +45,7 @@ class Extent:
         self._draw(centre - 0.94 * half)
         return True
 
-    def _draw(self, corner: FloatArray) -> None:
+    def _draw(self, corner: Floats) -> None:
         """The grid, with its labels along the edges through `corner` (2,)."""
         assert self.square is not None
         lines, labels = grid(*self.square)

@@ -18,8 +18,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.colours import SCREEN_GRID, SCREEN_NEUTRAL, SCREEN_TRUTH, Colour, packed
-from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import Stamp, entity, import_rerun
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
 from fusion_service.recording.drawing.extent import Corners
@@ -169,7 +169,7 @@ def neighbours(
         yield Neighbour("truth", name, _moved(table, there, origin))
 
 
-def predicted(message: LocalTracks, time: int) -> tuple[FloatArray, FloatArray]:
+def predicted(message: LocalTracks, time: int) -> tuple[Floats, Floats]:
     """Means (T, n) and covariances (T, n, n) of the tracks, moved on to `time` by their velocities."""
     means, covariances = track_moments(message)
     F = np.eye(len(message.space))
@@ -187,7 +187,7 @@ def extent(table: Table) -> float:
     return float((np.linalg.norm(table.place.xy, axis=1) + 2.5 * spread).max())
 
 
-def _moved(table: Table, rows: NDArray[np.intp], origin: FloatArray) -> Table:
+def _moved(table: Table, rows: NDArray[np.intp], origin: Floats) -> Table:
     part = table.part(rows)
     return Table(
         part.epoch, part.ids, part.times, part.place._replace(xy=part.place.xy - origin), part.codes, part.mass

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy
+from fusion_service.arrays import Floats
 from fusion_service.densities import moments
-from fusion_service.linalg import FloatArray
 from schemas import Disk, Ecef, Enu, Frame, GlobalTracks, Height, LocalTracks, Polygon, Sector, SensorInfo
 
 __all__ = [
@@ -39,7 +39,7 @@ QUANTILE = -2 * math.log(0.05)
 CORNERS = 24
 
 
-def circle(corners: int = CORNERS) -> FloatArray:
+def circle(corners: int = CORNERS) -> Floats:
     """Points (2, corners + 1) of the unit circle, the last one the first again."""
     return np.stack([f(np.linspace(0, 2 * np.pi, corners + 1)) for f in (np.cos, np.sin)])
 
@@ -50,20 +50,20 @@ RING = circle()
 class Place(NamedTuple):
     """Positions in a chart: xy (T, 2) east and north in m, z (T,) up, covariance (T, 2, 2) of xy."""
 
-    xy: FloatArray
-    z: FloatArray
-    covariance: FloatArray
+    xy: Floats
+    z: Floats
+    covariance: Floats
 
 
 class Outline(NamedTuple):
     """S line strips, one after the other: xy (P, 2) in m, their lengths (S,) and whose they are (S,)."""
 
-    xy: FloatArray
+    xy: Floats
     lengths: NDArray[np.int64]
     owner: NDArray[np.int64]
 
 
-def track_moments(message: LocalTracks | GlobalTracks) -> tuple[FloatArray, FloatArray]:
+def track_moments(message: LocalTracks | GlobalTracks) -> tuple[Floats, Floats]:
     """Mean (T, n) and covariance (T, n, n) of each track: a mixture by its moments."""
     return moments(message.means, message.covariances, message.weights, message.counts)
 
@@ -79,8 +79,8 @@ class Chart:
 
     def place(
         self,
-        means: FloatArray,
-        covariances: FloatArray,
+        means: Floats,
+        covariances: Floats,
         space: tuple[str, ...],
         frame: Frame,
         height: Height | None = None,
@@ -99,11 +99,11 @@ class Chart:
             z = (height.value if height else 0.0) - origin - (xy * xy).sum(axis=1) / (2 * geodesy.A)
         return Place(xy, z, covariances[:, :2, :2])
 
-    def plane(self, xy: FloatArray) -> FloatArray:
+    def plane(self, xy: Floats) -> Floats:
         """(..., 2) as a 2D view draws it."""
         return xy * (1.0, -1.0)
 
-    def geo(self, xy: FloatArray, z: FloatArray) -> FloatArray | None:
+    def geo(self, xy: Floats, z: Floats) -> Floats | None:
         """Latitude and longitude (..., 2) in degrees, None in a frame that is not about a place on Earth."""
         if not isinstance(self.frame, Enu):
             return None
@@ -130,7 +130,7 @@ def ellipses(place: Place, dashed: NDArray[np.bool_], corners: int = CORNERS) ->
     )
 
 
-def outline(info: SensorInfo) -> tuple[list[FloatArray], Frame]:
+def outline(info: SensorInfo) -> tuple[list[Floats], Frame]:
     """The edges of a sensor's field of view as (P, 2) strips of x, y in m, and the frame they are in."""
     frame, centre = info.frame, np.array(info.position[:2])
     if isinstance(info.coverage, Polygon):
@@ -141,7 +141,7 @@ def outline(info: SensorInfo) -> tuple[list[FloatArray], Frame]:
     return [centre + edge for edge in _edges(info.coverage)], frame
 
 
-def _edges(coverage: Disk | Sector | None) -> list[FloatArray]:
+def _edges(coverage: Disk | Sector | None) -> list[Floats]:
     """As seen from the sensor."""
     if coverage is None:
         return []
@@ -150,13 +150,13 @@ def _edges(coverage: Disk | Sector | None) -> list[FloatArray]:
     return [_sector(coverage)]
 
 
-def _arc(radius: float, azimuth: float, width: float) -> FloatArray:
+def _arc(radius: float, azimuth: float, width: float) -> Floats:
     """Points at `radius` from `azimuth` on through `width` clockwise."""
     angles = azimuth + np.linspace(0.0, width, max(2, math.ceil(abs(width) / math.radians(4)) + 1))
     return radius * np.stack([np.sin(angles), np.cos(angles)], axis=-1)
 
 
-def _sector(sector: Sector) -> FloatArray:
+def _sector(sector: Sector) -> Floats:
     half = sector.width / 2
     outer = _arc(sector.radius, sector.azimuth - half, sector.width)
     inner = _arc(sector.inner, sector.azimuth + half, -sector.width)
@@ -177,7 +177,7 @@ def _round(size: float) -> float:
     return step * next(f for f in (1, 2, 5, 10) if size / (f * step) <= 8)
 
 
-def grid(low: FloatArray, high: FloatArray) -> tuple[list[FloatArray], list[str]]:
+def grid(low: Floats, high: Floats) -> tuple[list[Floats], list[str]]:
     """Lines every round number of metres over the square `low`..`high` (2,) of east and north, and their labels."""
     step = _round(float(np.max(high - low)))
     low, high = np.floor(low / step) * step, np.ceil(high / step) * step

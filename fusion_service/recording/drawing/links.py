@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.recording.columns import entity
 from fusion_service.recording.drawing.tables import Table
 from schemas import GlobalTracks
@@ -25,9 +25,7 @@ def links_path(centre: str, source: str) -> str:
     return entity("picture", "global", centre, "links", source)
 
 
-def links(
-    message: GlobalTracks, fused: Table, local: Mapping[str, Table]
-) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+def links(message: GlobalTracks, fused: Table, local: Mapping[str, Table]) -> Iterator[tuple[str, Floats, Floats]]:
     """Of each source of `message`: its name, ends (S, 2, 2) in m, local track first, and their heights (S, 2).
 
     fused: the global tracks that are drawn; local: those of each source.

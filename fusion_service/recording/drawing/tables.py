@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.recording.drawing.geometry import Place
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks
 
@@ -45,7 +45,7 @@ class Table:
     times: NDArray[np.int64]
     place: Place
     codes: Codes
-    mass: FloatArray
+    mass: Floats
 
     def part(self, rows: NDArray[Any]) -> Table:
         """Some of the rows, by numbers or by a mask (T,)."""
@@ -54,7 +54,7 @@ class Table:
 
 
 def tabulate(
-    epoch: int, time: int, ids: U64, place: Place, codes: Codes | None = None, mass: FloatArray | None = None
+    epoch: int, time: int, ids: U64, place: Place, codes: Codes | None = None, mass: Floats | None = None
 ) -> Table:
     """A table of one message, without what is not to be placed (its vertical misses the Earth). codes: None for
     confirmed; mass: None for 1."""
@@ -71,7 +71,7 @@ class DrawnComponents(NamedTuple):
 
     rows: NDArray[np.intp]
     owner: NDArray[np.intp]
-    weights: FloatArray
+    weights: Floats
     over: int
 
 
@@ -113,7 +113,7 @@ def hold(old: Table | None, new: Table, listed: U64, since: int) -> Table:
 
 def levels(table: Table) -> NDArray[np.uint16]:
     """The opacity (T,) of each row, from 0 to LEVELS - 1."""
-    mass: FloatArray = np.minimum(np.nan_to_num(table.mass), 1.0) * FAINTER[table.codes]
+    mass: Floats = np.minimum(np.nan_to_num(table.mass), 1.0) * FAINTER[table.codes]
     level: NDArray[np.uint16] = np.rint((LEVELS - 1) * np.maximum(mass, 0.0)).astype(np.uint16)
     return level
 

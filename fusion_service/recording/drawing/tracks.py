@@ -22,8 +22,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.colours import SCREEN_NEUTRAL, SCREEN_TRUTH, Colour, centre_colours, screen_source_colours
-from fusion_service.linalg import FloatArray
 from fusion_service.recording.columns import ColumnWriter, Stamp, entity
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
 from fusion_service.recording.drawing.extent import Corners, Extent
@@ -264,7 +264,7 @@ class Drawing:
         self.changed = True
         return True
 
-    def _grow(self, xy: FloatArray, *, main: bool) -> None:
+    def _grow(self, xy: Floats, *, main: bool) -> None:
         self.changed |= self._extent.grow(xy, main=main)
 
 

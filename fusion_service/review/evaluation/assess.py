@@ -29,8 +29,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from fusion_service.arrays import Floats
 from fusion_service.coverage import covers
-from fusion_service.linalg import FloatArray
 from fusion_service.metrics import DENSE
 from fusion_service.review.evaluation.consistency import Consistency, SourceAgreement
 from fusion_service.review.evaluation.fusion_gain import fusion_gain
@@ -82,7 +82,7 @@ class Evaluation:
     shared: dict[str, dict[str, Any]]
     left_out: dict[str, str]
     begins: NDArray[np.int64]
-    confirm: FloatArray
+    confirm: Floats
 
     def as_json(self, scenario: str, rule: str, recording: str) -> dict[str, Any]:
         """The summary as plain values, ready for `json.dumps`."""
@@ -297,7 +297,7 @@ class _Score:
                 if picture is not None:
                     self._tallies[key].expect(k, float(picture.existence.sum()))
 
-    def _note_first(self, k: int, there: NDArray[np.intp], places: FloatArray) -> None:
+    def _note_first(self, k: int, there: NDArray[np.intp], places: Floats) -> None:
         known = self._seen[k] > 0
         unknown = there[(self._begins[there] < 0) & ~known[there]]
         if len(unknown):

@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.metrics import assign_near
 from fusion_service.review.snapshots import Indices
 
@@ -40,7 +40,7 @@ class Instant(NamedTuple):
     tracks: Indices
     i: Indices
     j: Indices
-    d: FloatArray
+    d: Floats
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -95,7 +95,7 @@ class Following:
 def siap_of(
     segments: NDArray[np.int64],
     times: NDArray[np.int64],
-    lives: FloatArray,
+    lives: Floats,
     counts: tuple[float, float, float, float],
     accuracy: tuple[float, float],
 ) -> Siap:

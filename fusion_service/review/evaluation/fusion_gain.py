@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.review.evaluation.scoring import Scores, averages, bounds
 
 __all__ = ["fusion_gain"]
@@ -38,7 +38,7 @@ def fusion_gain(sources: list[Scores], fused: Scores, seen: NDArray[np.int64], d
     return shared
 
 
-def _best_single(sources: list[Scores], both: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
+def _best_single(sources: list[Scores], both: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Error and NEES of the best single source on the pairs `both` (K, T), R of them: of those that saw the target
     then, the one with the least mean square on all the pairs of this target that the same sources saw."""
     _, group = np.nonzero(both)

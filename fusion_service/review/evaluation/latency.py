@@ -13,7 +13,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.review.snapshots import TrackMessage
 from schemas import GlobalTracks, LocalIntensity, SensorInfo, StepLog, digest
 
@@ -109,7 +109,7 @@ def _remember(known: dict[Name, Value], name: Name, value: Value) -> None:
         del known[next(iter(known))]
 
 
-def _latency(delays: FloatArray) -> Latency:
+def _latency(delays: Floats) -> Latency:
     median, p95 = np.quantile(delays, (0.5, 0.95)).tolist()
     top = max(float(np.quantile(delays, 0.99)), float(delays.min()) + 1e-6)
     counts, edges = np.histogram(np.minimum(delays, top), bins=BINS)

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fusion_service.arrays import Floats
 from fusion_service.errors import ReviewError
-from fusion_service.linalg import FloatArray
 from fusion_service.review.evaluation.logbook import Logbook
 from fusion_service.review.snapshots import STALE_PERIODS, STALE_STEPS, Times, truth_path, truth_positions
 from schemas import Frame, Motion, Truth
@@ -42,7 +42,7 @@ class ScoredTruth(NamedTuple):
 
     times: Times
     targets: tuple[int, ...]
-    states: FloatArray
+    states: Floats
 
 
 def reference_for(

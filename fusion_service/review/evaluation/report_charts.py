@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.colours import (
     BLUE,
     GREEN,
@@ -23,7 +24,6 @@ from fusion_service.colours import (
     VERMILION,
     source_colours,
 )
-from fusion_service.linalg import FloatArray
 from fusion_service.review.evaluation.latency import BINS
 from fusion_service.review.evaluation.scoring import WINDOW, Scores
 from fusion_service.review.evaluation.tables import ScoredCentre, power_of_ten, row_name
@@ -40,7 +40,7 @@ POINTS = 500
 """Points of a line, at most: means over equal parts of the mission where there are more times."""
 SIZE = (5.0, 3.0)
 PARTS = {"localisation": SKY, "missed": ORANGE, "false": VERMILION}
-Line = tuple[str, str, float, Scores, FloatArray]
+Line = tuple[str, str, float, Scores, Floats]
 """Name, colour, width, scores, and seconds (K,) since the first scored time."""
 STYLE: Any = {
     "svg.fonttype": "none",
@@ -165,12 +165,12 @@ def _lines(rows: Sequence[ScoredCentre]) -> list[Line]:
     ]
 
 
-def _seconds(times: NDArray[np.int64]) -> FloatArray:
-    seconds: FloatArray = (times - times[0]) / 1e9
+def _seconds(times: NDArray[np.int64]) -> Floats:
+    seconds: Floats = (times - times[0]) / 1e9
     return seconds
 
 
-def _thin(seconds: FloatArray, values: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _thin(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
     """Means over parts of the mission, so that a line has `POINTS` at most."""
     if len(seconds) <= POINTS:
         return seconds, values

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from scipy.special import gammaincinv
 
-from fusion_service.linalg import FloatArray
+from fusion_service.arrays import Floats
 from fusion_service.metrics import DENSE, assign_near, near_pairs, nees, nees_bounds
 from fusion_service.review.evaluation.continuity import Following, Instant, Siap, ospa2, siap_of
 from fusion_service.review.snapshots import Block, Times
@@ -47,23 +47,23 @@ class Series:
     probabilities expect (NaN where it says none); SIAP's completeness, ambiguity, spuriousness.
     ospa2: at the times with the indices `windows`."""
 
-    gospa: FloatArray
-    localisation: FloatArray
-    missed: FloatArray
-    false: FloatArray
-    ospa: FloatArray
-    rmse: FloatArray
-    anees: FloatArray
-    low: FloatArray
-    high: FloatArray
+    gospa: Floats
+    localisation: Floats
+    missed: Floats
+    false: Floats
+    ospa: Floats
+    rmse: Floats
+    anees: Floats
+    low: Floats
+    high: Floats
     pairs: NDArray[np.int64]
     shown: NDArray[np.int64]
-    expected: FloatArray
-    completeness: FloatArray
-    ambiguity: FloatArray
-    spuriousness: FloatArray
+    expected: Floats
+    completeness: Floats
+    ambiguity: Floats
+    spuriousness: Floats
     windows: NDArray[np.int64]
-    ospa2: FloatArray
+    ospa2: Floats
 
     def as_json(self) -> dict[str, list[Any]]:
         """Rounded to six digits, None for what does not exist."""
@@ -89,8 +89,8 @@ class Scores:
     anees: float
     identity_switches: int
     bounds: tuple[float, float]
-    errors: FloatArray
-    nees: FloatArray
+    errors: Floats
+    nees: Floats
     rmse_velocity: float
     ospa: float
     ospa2: float
@@ -119,7 +119,7 @@ class Tally:
     times (K,); truth (K, T, m): position, and then velocity, NaN where it is not known or a target does not exist.
     """
 
-    def __init__(self, times: Times, truth: FloatArray, d: int, c: float) -> None:
+    def __init__(self, times: Times, truth: Floats, d: int, c: float) -> None:
         count, targets = truth.shape[:2]
         self._times, self._truth, self._d, self._c = times, truth, d, c
         self._parts = np.zeros((count, 3))
@@ -181,7 +181,7 @@ class Tally:
         targets: NDArray[np.intp],
         rows: NDArray[np.intp],
         tracks: NDArray[np.intp],
-        apart: FloatArray,
+        apart: Floats,
         objects: int,
         shown: int,
         block: Block,
@@ -283,7 +283,7 @@ class Tally:
         )
 
 
-def averages(errors: FloatArray, squared: FloatArray) -> tuple[float, float]:
+def averages(errors: Floats, squared: Floats) -> tuple[float, float]:
     """RMSE and ANEES of pairs (R,), (R,); NaN without a pair."""
     return (float(np.sqrt(np.mean(errors**2))), float(np.mean(squared))) if len(errors) else (np.nan, np.nan)
 
@@ -300,7 +300,7 @@ def plain(value: Any) -> Any:
     return None if isinstance(value, float) and not np.isfinite(value) else value
 
 
-def _lengths(rows: FloatArray) -> FloatArray:
+def _lengths(rows: Floats) -> Floats:
     """(R, m) -> (R,), NaN where m is 0."""
     return np.sqrt((rows * rows).sum(axis=1)) if rows.shape[1] else np.full(len(rows), np.nan)
 

@@ -9,22 +9,24 @@ An element is frozen when it has converged: its bits do not depend on the others
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray, inner, matvec, outer, product, total, trace
+from fusion_service.arrays import Floats
+from fusion_service.linalg import inner, matvec, outer, product, total, trace
+from fusion_service.rules.weights.pairs import FLAT, Ends
+
+__all__ = ["best_weight", "spread_inverse"]
 
 ROUNDS = 100
 DONE = 1e-11
 """Slope, relative to the criterion, that counts as zero."""
 
-Ends = tuple[FloatArray, FloatArray]
 
-
-def best_weight(criterion: str, M: Ends, *, bump: FloatArray | None = None, rho: float = 1.0) -> FloatArray:
+def best_weight(criterion: str, M: Ends, *, bump: Floats | None = None, rho: float = 1.0) -> Floats:
     """The t (B,) in [0, 1] with the largest det M(t), or the smallest trace M(t)^-1; M as in `pairs.best_weight`."""
     size = M[0].shape[-1]
     lo, hi = np.zeros((2, size), M[0].dtype)
     hi += 1.0
     first, last = _slope(criterion, lo, M, bump, rho)[0], _slope(criterion, hi, M, bump, rho)[0]
-    flat = ~((first > 1e-10) | (last < -1e-10))
+    flat = ~((first > FLAT) | (last < -FLAT))
     out = np.where(flat, 0.5, np.where(last >= 0.0, hi, lo))
     at = np.flatnonzero(~flat & (first > 0.0) & (last < 0.0))
     lo, hi = lo[at], hi[at]
@@ -45,16 +47,14 @@ def best_weight(criterion: str, M: Ends, *, bump: FloatArray | None = None, rho:
     return out
 
 
-def spread_inverse(U: FloatArray, d: FloatArray, tau: FloatArray) -> tuple[FloatArray, FloatArray]:
+def spread_inverse(U: Floats, d: Floats, tau: Floats) -> tuple[Floats, Floats]:
     """V = (U^-1 + tau d d')^-1 (n, n, B), and V d (n, B), of which the latter is exact to rounding."""
     y = matvec(U, d)
     e = y / (1.0 + tau * total(d * y))
     return U - outer(tau * e, y), e
 
 
-def _slope(
-    criterion: str, t: FloatArray, M: Ends, bump: FloatArray | None, rho: float
-) -> tuple[FloatArray, FloatArray]:
+def _slope(criterion: str, t: Floats, M: Ends, bump: Floats | None, rho: float) -> tuple[Floats, Floats]:
     """First and second derivative of log det M, or of -log trace M^-1."""
     d0, d1 = (1.0 - rho) * (1.0 - t) + rho, (1.0 - rho) * t + rho
     G = (1.0 - t) / d0 * M[0] + t / d1 * M[1]
@@ -82,7 +82,7 @@ def _slope(
     return first, (bend - 2.0 * _trace_product(product(X, X), V)) / f + first * first
 
 
-def _trace_product(A: FloatArray, B: FloatArray) -> FloatArray:
+def _trace_product(A: Floats, B: Floats) -> Floats:
     """tr(A B) (B,) of any A and B."""
     out = total(A[0] * B[:, 0])
     for i in range(1, len(A)):

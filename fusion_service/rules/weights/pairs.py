@@ -19,7 +19,10 @@ from functools import cache
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray, total
+from fusion_service.arrays import Floats
+from fusion_service.linalg import total
+
+__all__ = ["FLAT", "LIMIT", "Ends", "best_weight"]
 
 LIMIT = 6
 ROUNDS = 60
@@ -30,12 +33,12 @@ CLOSE = 3e-5
 """A relative step of Laguerre's method after which the error, about its cube, is nothing."""
 
 
-Ends = tuple[FloatArray, FloatArray]
+Ends = tuple[Floats, Floats]
 
 
 def best_weight(
-    criterion: str, M: Ends, inverses: Ends, dets: Ends, *, bump: FloatArray | None = None, rho: float = 1.0
-) -> FloatArray:
+    criterion: str, M: Ends, inverses: Ends, dets: Ends, *, bump: Floats | None = None, rho: float = 1.0
+) -> Floats:
     """The t (B,) in [0, 1] with the largest det M(t), or the smallest trace M(t)^-1.
 
     M(t) = (1-t) M0 + t M1 + t(1-t) bump bump', with bump (n, B) or None; or, for rho < 1,
@@ -77,7 +80,7 @@ def best_weight(
     return _newton(_trace_slope, c, n, rho)
 
 
-def _between(M: Ends, bump: FloatArray | None, t: FloatArray) -> FloatArray:
+def _between(M: Ends, bump: Floats | None, t: Floats) -> Floats:
     """M(t) at some nodes (K,), for rho = 1: lower triangles (n, n, K, B)."""
     n, size = M[0].shape[0], M[0].shape[-1]
     t = t[:, None]
@@ -91,20 +94,20 @@ def _between(M: Ends, bump: FloatArray | None, t: FloatArray) -> FloatArray:
     return out
 
 
-def _form(A: FloatArray, x: FloatArray) -> FloatArray:
+def _form(A: Floats, x: Floats) -> Floats:
     """x' A x (B,)."""
     return total(linalg.matvec(A, x) * x)
 
 
 @cache
-def _nodes(count: int) -> FloatArray:
+def _nodes(count: int) -> Floats:
     """The inner Chebyshev-Lobatto nodes of [0, 1]."""
-    out: FloatArray = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, count + 1) / (count + 1))
+    out: Floats = 0.5 - 0.5 * np.cos(np.pi * np.arange(1, count + 1) / (count + 1))
     return out
 
 
 @cache
-def _monomials(degree: int, slopes: int) -> FloatArray:
+def _monomials(degree: int, slopes: int) -> Floats:
     """From values at 0 and 1, so many slopes there, and values at `_nodes` to coefficients in z = 2t - 1."""
     t = np.array([0.0, 1.0, *_nodes(degree - 1 - slopes)])
     rows = list(np.vander(2.0 * t - 1.0, degree + 1, increasing=True))
@@ -114,7 +117,7 @@ def _monomials(degree: int, slopes: int) -> FloatArray:
 
 
 @cache
-def _polar(n: int, slopes: int) -> FloatArray:
+def _polar(n: int, slopes: int) -> Floats:
     """From the same to the coefficients of q(u)."""
     k = np.arange(n + 1.0)
     t = np.array([0.0, 1.0, *_nodes(n - 1 - slopes)])[:, None]
@@ -122,19 +125,19 @@ def _polar(n: int, slopes: int) -> FloatArray:
     first, last = (k == 1) - float(n) * (k == 0), float(n) * (k == n) - (k == n - 1)
     rows[2:2] = [first, last][:slopes]
     e = np.linalg.inv(np.array(rows))
-    out: FloatArray = k[1:, None] * e[1:] - (n - k[:-1, None]) * e[:-1]
+    out: Floats = k[1:, None] * e[1:] - (n - k[:-1, None]) * e[:-1]
     return out
 
 
-def _combine(matrix: FloatArray, values: FloatArray) -> FloatArray:
+def _combine(matrix: Floats, values: Floats) -> Floats:
     columns = matrix.reshape(*matrix.shape, *(1,) * (values.ndim - 1))
-    out: FloatArray = columns[:, 0] * values[0]
+    out: Floats = columns[:, 0] * values[0]
     for k in range(1, len(values)):
         out += columns[:, k] * values[k]
     return out
 
 
-def _laguerre(q: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
+def _laguerre(q: Floats, first: Floats, last: Floats) -> Floats:
     """t where q(u) (n, B) is zero; the better end if nowhere, a half if it is flat."""
     steep = (first > FLAT) | (last < -FLAT)
     inside = steep & (first > 0.0) & (last < 0.0)
@@ -155,7 +158,7 @@ def _laguerre(q: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
             value *= u
             value += q[k]
         if bend is None:
-            root: FloatArray | float = 0.0
+            root: Floats | float = 0.0
         else:
             square = slope * slope
             square *= m - 1.0
@@ -178,7 +181,7 @@ def _laguerre(q: FloatArray, first: FloatArray, last: FloatArray) -> FloatArray:
     return out
 
 
-def _with_derivatives(c: FloatArray) -> FloatArray:
+def _with_derivatives(c: Floats) -> Floats:
     """(degree + 1, 3, k, B): coefficients of polynomials in z = 2t - 1 and of their two derivatives by t."""
     out = np.zeros((len(c), 3, *c.shape[1:]))
     power = 2.0 * np.arange(1, len(c))[:, None, None]
@@ -188,10 +191,10 @@ def _with_derivatives(c: FloatArray) -> FloatArray:
     return out
 
 
-def _polynomials(t: FloatArray, c: FloatArray) -> FloatArray:
+def _polynomials(t: Floats, c: Floats) -> Floats:
     """Values, first and second derivatives, (3, k, B), from `_with_derivatives`."""
     z = t + t - 1.0
-    out: FloatArray = c[-1] * z
+    out: Floats = c[-1] * z
     out += c[-2]
     for row in c[-3::-1]:
         out *= z
@@ -199,7 +202,7 @@ def _polynomials(t: FloatArray, c: FloatArray) -> FloatArray:
     return out
 
 
-def _share(t: FloatArray, rho: float) -> tuple[FloatArray, ...]:
+def _share(t: Floats, rho: float) -> tuple[Floats, ...]:
     """s = c(t) + c(1-t) and r = c(t) / s, each with its first and second derivative."""
     d0, d1 = (1.0 - rho) * (1.0 - t) + rho, (1.0 - rho) * t + rho
     c1 = t / d1
@@ -213,7 +216,7 @@ def _share(t: FloatArray, rho: float) -> tuple[FloatArray, ...]:
     return s, ds, dds, r, dr, (bend1 - r * dds - 2.0 * dr * ds) / s
 
 
-def _det_slope(t: FloatArray, c: FloatArray, n: int, rho: float) -> tuple[FloatArray, FloatArray]:
+def _det_slope(t: Floats, c: Floats, n: int, rho: float) -> tuple[Floats, Floats]:
     """First and second derivative of log det M."""
     if rho == 1.0:
         (f,), (df,), (ddf,) = _polynomials(t, c)
@@ -225,7 +228,7 @@ def _det_slope(t: FloatArray, c: FloatArray, n: int, rho: float) -> tuple[FloatA
     return u * dr + n * v, (ddf / f - u * u) * dr * dr + u * ddr + n * (dds / s - v * v)
 
 
-def _trace_slope(t: FloatArray, c: FloatArray, n: int, rho: float) -> tuple[FloatArray, FloatArray]:
+def _trace_slope(t: Floats, c: Floats, n: int, rho: float) -> tuple[Floats, Floats]:
     """First and second derivative of -trace M^-1, over trace M^-1."""
     if rho == 1.0:
         first, second = _log_ratio(t, c)
@@ -236,7 +239,7 @@ def _trace_slope(t: FloatArray, c: FloatArray, n: int, rho: float) -> tuple[Floa
     return v - u, dds / s + 2.0 * v * (u - v) - second * dr * dr - first * ddr
 
 
-def _log_ratio(t: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _log_ratio(t: Floats, c: Floats) -> tuple[Floats, Floats]:
     """g'/g and g''/g of g = trace adj M / det M."""
     (f, a), (df, da), (ddf, dda) = _polynomials(t, c)
     u, v = da / a, df / f
@@ -244,10 +247,10 @@ def _log_ratio(t: FloatArray, c: FloatArray) -> tuple[FloatArray, FloatArray]:
     return first, dda / a - 2.0 * first * v - ddf / f
 
 
-Slope = Callable[[FloatArray, FloatArray, int, float], tuple[FloatArray, FloatArray]]
+Slope = Callable[[Floats, Floats, int, float], tuple[Floats, Floats]]
 
 
-def _newton(slope: Slope, c: FloatArray, n: int, rho: float, ends: tuple[FloatArray, ...] = ()) -> FloatArray:
+def _newton(slope: Slope, c: Floats, n: int, rho: float, ends: tuple[Floats, ...] = ()) -> Floats:
     """Where in [0, 1] a falling slope passes zero; the better end if nowhere, a half if it is flat.
 
     `c` (degree + 1, k, B): coefficients of the polynomials; `ends`: the slope at 0 and 1 where it is known.

@@ -7,16 +7,19 @@ has converged is turned no more: its bits do not depend on the others.
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray
-from fusion_service.rules.sources import condition
+from fusion_service.arrays import Floats
+from fusion_service.linalg import condition
+from fusion_service.rules.base.matrices import lower_inverse
+
+__all__ = ["eigen", "pencil"]
 
 SWEEPS = 30
 
 
-def pencil(P1: FloatArray, P2: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def pencil(P1: Floats, P2: Floats) -> tuple[Floats, Floats, Floats, Floats]:
     """T (n, n, B), its inverse (n, n, B), ratio (n, B) > 0, and what rounding grows by (B,).
 
-    The latter is `sources.condition` of P_2 in the coordinates of P_1's factor: of what is diagonalised.
+    The latter is `linalg.condition` of P_2 in the coordinates of P_1's factor: of what is diagonalised.
     """
     L, d = linalg.ldl(P1)
     F = L * np.sqrt(d)
@@ -28,7 +31,7 @@ def pencil(P1: FloatArray, P2: FloatArray) -> tuple[FloatArray, FloatArray, Floa
     return linalg.product(F, Q), linalg.product(Q.swapaxes(0, 1), inverse), ratio, grown
 
 
-def eigen(A: FloatArray) -> tuple[FloatArray, FloatArray]:
+def eigen(A: Floats) -> tuple[Floats, Floats]:
     """Eigenvalues (n, B), in no order, and orthonormal vectors (n, n, B), in columns, of symmetric A."""
     n = len(A)
     X = np.zeros((2 * n, *A.shape[1:]), A.dtype)  # what is left of A, above the vectors
@@ -46,7 +49,7 @@ def eigen(A: FloatArray) -> tuple[FloatArray, FloatArray]:
     return X[range(n), range(n)], X[n:]
 
 
-def _turn(X: FloatArray, p: int, q: int, small: float, floor: FloatArray) -> bool:
+def _turn(X: Floats, p: int, q: int, small: float, floor: Floats) -> bool:
     """Rotate p and q so that X[p, q] is zero, where it is not small."""
     n = X.shape[1]
     b, x, y = X[p, q].copy(), X[p, p].copy(), X[q, q].copy()
@@ -65,15 +68,3 @@ def _turn(X: FloatArray, p: int, q: int, small: float, floor: FloatArray) -> boo
     X[p, p], X[q, q] = x - t, y + t
     X[p, q] = X[q, p] = np.where(busy, 0.0, b)
     return True
-
-
-def lower_inverse(F: FloatArray) -> FloatArray:
-    """F^-1 (n, n, B) of lower triangular F."""
-    out = np.zeros_like(F)
-    for i in range(len(F)):
-        out[i, i] = 1.0 / F[i, i]
-        for k in range(i):
-            out[i, : k + 1] -= F[i, k] * out[k, : k + 1]
-        if i:
-            out[i, :i] *= out[i, i]
-    return out

@@ -10,8 +10,11 @@ from collections.abc import Callable
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray, outer, total
-from fusion_service.rules.sources import Sources
+from fusion_service.arrays import Floats
+from fusion_service.linalg import outer, total
+from fusion_service.rules.base.block import Sources
+
+__all__ = ["Cost", "lowest"]
 
 POINTS = 65
 GOLDEN = (5.0**0.5 - 1.0) / 2.0
@@ -20,24 +23,24 @@ ROUNDS = 80
 STEP = 1e-5
 """Of the central differences, in logarithms."""
 
-Cost = Callable[[FloatArray], FloatArray]
+Cost = Callable[[Floats], Floats]
 """Of weights (N, B): (B,)."""
 
 
-def lowest(cost: Cost, sources: Sources) -> FloatArray:
+def lowest(cost: Cost, sources: Sources) -> Floats:
     """Weights (N, B) with a low cost."""
     if sources.count == 1:
         return sources.uniform
 
-    def safe(w: FloatArray) -> FloatArray:
+    def safe(w: Floats) -> Floats:
         value = cost(w)
         return np.where(np.isnan(value), np.inf, value)
 
     return _scan(safe, sources.uniform) if sources.count == 2 else _descend(safe, sources.uniform)
 
 
-def _scan(cost: Cost, w: FloatArray) -> FloatArray:
-    def value(t: FloatArray) -> FloatArray:
+def _scan(cost: Cost, w: Floats) -> Floats:
+    def value(t: Floats) -> Floats:
         return cost(np.stack([t, 1.0 - t]))
 
     best, low = w[0], np.full_like(w[0], np.inf)
@@ -60,7 +63,7 @@ def _scan(cost: Cost, w: FloatArray) -> FloatArray:
     return np.stack([best, 1.0 - best])
 
 
-def _descend(cost: Cost, w: FloatArray) -> FloatArray:
+def _descend(cost: Cost, w: Floats) -> Floats:
     N = len(w)
     z = np.zeros_like(w)
     identity = np.zeros((N, *w.shape), w.dtype)
@@ -94,13 +97,13 @@ def _descend(cost: Cost, w: FloatArray) -> FloatArray:
     return _weights(z)
 
 
-def _weights(z: FloatArray) -> FloatArray:
+def _weights(z: Floats) -> Floats:
     w = np.exp(z - z.max(axis=0))
-    out: FloatArray = w / total(w)
+    out: Floats = w / total(w)
     return out
 
 
-def _slope(cost: Cost, z: FloatArray) -> FloatArray:
+def _slope(cost: Cost, z: Floats) -> Floats:
     out = np.empty_like(z)
     for i in range(len(z)):
         for sign in (1.0, -1.0):

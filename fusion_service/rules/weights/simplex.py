@@ -16,10 +16,13 @@ depend on the others.
 from typing import Protocol, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.linalg import FloatArray, inner, product, total, trace
+from fusion_service.arrays import Bools, Floats
+from fusion_service.linalg import inner, product, total, trace
+from fusion_service.rules.base.matrices import diagonal
+
+__all__ = ["GAP", "Model", "best_weights", "gap", "gradient"]
 
 GAP = 1e-9
 """Weights whose gap is below this are optimal."""
@@ -29,37 +32,37 @@ ROUNDS = 60
 class Model(Protocol):
     """A concave matrix function of N weights."""
 
-    def __call__(self, w: FloatArray, /) -> tuple[FloatArray, FloatArray]:
+    def __call__(self, w: Floats, /) -> tuple[Floats, Floats]:
         """M (n, n, B) and dM/dw_i (n, n, N, B), the latter up to a matrix common to all i."""
 
-    def bend(self, w: FloatArray, G: FloatArray, /) -> FloatArray | None:
+    def bend(self, w: Floats, G: Floats, /) -> Floats | None:
         """-tr(G d2M/dw_i dw_j) (N, N, B) for G >= 0: positive semidefinite. None where M is linear."""
 
-    def take(self, index: NDArray[np.bool_]) -> Self:
+    def take(self, index: Bools) -> Self:
         """The model of some elements of the batch."""
 
 
-def gap(w: FloatArray, g: FloatArray) -> FloatArray:
+def gap(w: Floats, g: Floats) -> Floats:
     """Optimality gap (B,) of weights w (N, B) with gradient g (N, B)."""
-    out: FloatArray = total(w * g) - g.min(axis=0)
+    out: Floats = total(w * g) - g.min(axis=0)
     return out
 
 
-def gradient(criterion: str, V: FloatArray, D: FloatArray) -> FloatArray:
+def gradient(criterion: str, V: Floats, D: Floats) -> Floats:
     """Gradient (N, B) of -log det M or log trace M^-1, from V = M^-1 (n, n, B) and D = dM/dw (n, n, N, B)."""
     if criterion == "det":
         return -inner(V[:, :, None], D)
     return -inner(product(V, V)[:, :, None], D) / trace(V)
 
 
-def _evaluate(criterion: str, model: Model, w: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _evaluate(criterion: str, model: Model, w: Floats) -> tuple[Floats, Floats, Floats]:
     """V, D and the value of the criterion."""
     M, D = model(w)
     V, det, _ = linalg.sweep(M)
     return V, D, -np.log(det) if criterion == "det" else np.log(trace(V))
 
 
-def best_weights(criterion: str, model: Model, start: FloatArray) -> FloatArray:
+def best_weights(criterion: str, model: Model, start: Floats) -> Floats:
     """The best weights (N, B), from a positive `start` that sums to 1.
 
     Sources that a best weighting leaves out get exactly zero. Check with `gap`: hopeless input comes back
@@ -103,7 +106,7 @@ def best_weights(criterion: str, model: Model, start: FloatArray) -> FloatArray:
     return _without_idle(criterion, model, best, slack)
 
 
-def _without_idle(criterion: str, model: Model, w: FloatArray, s: FloatArray) -> FloatArray:
+def _without_idle(criterion: str, model: Model, w: Floats, s: Floats) -> Floats:
     """Set to zero the weights that the constraint holds, where the result is still optimal."""
     clean = np.where(w < s, 0.0, w)
     clean = clean / total(clean)
@@ -111,22 +114,14 @@ def _without_idle(criterion: str, model: Model, w: FloatArray, s: FloatArray) ->
     return np.where(gap(clean, gradient(criterion, V, D)) <= 0.1 * GAP, clean, w)
 
 
-def _room(x: FloatArray, dx: FloatArray) -> FloatArray:
+def _room(x: Floats, dx: Floats) -> Floats:
     """The longest step (B,), at most 1, that keeps x positive."""
     limits = np.where(dx < 0.0, -0.99 * x / dx, 1.0)
-    out: FloatArray = np.minimum(limits.min(axis=0), 1.0)
+    out: Floats = np.minimum(limits.min(axis=0), 1.0)
     return out
 
 
-def diagonal(x: FloatArray) -> FloatArray:
-    """Diagonal matrices (N, N, B) of x (N, B)."""
-    out = np.zeros((len(x), *x.shape), x.dtype)
-    for i, row in enumerate(x):
-        out[i, i] = row
-    return out
-
-
-def _hessian(criterion: str, model: Model, w: FloatArray, V: FloatArray, D: FloatArray) -> FloatArray:
+def _hessian(criterion: str, model: Model, w: Floats, V: Floats, D: Floats) -> Floats:
     """Second derivatives (N, N, B): of -log det M; of trace M^-1, over trace M^-1."""
     E = product(V[:, :, None], D)
     if criterion == "det":
@@ -144,7 +139,7 @@ def _hessian(criterion: str, model: Model, w: FloatArray, V: FloatArray, D: Floa
     return H
 
 
-def _direction(H: FloatArray, residual: FloatArray) -> FloatArray:
+def _direction(H: Floats, residual: Floats) -> Floats:
     """Newton's step within sum(dw) = 0."""
     a = linalg.solve(H, residual)
     b = linalg.solve(H, np.ones_like(residual))

@@ -1,0 +1,94 @@
+"""Covariance intersection (CI): Julier and Uhlmann 1997; Sharma (4); Li-AA section II.
+
+    P^-1 = sum w_i P_i^-1,    P^-1 x = sum w_i P_i^-1 x_i
+
+The sources are fused as independent ones, with covariances inflated until the block-diagonal joint covariance bounds
+every admissible one. It is the geometric mean of the densities. Conservative whatever the correlation.
+
+Weights: min over w of det P or trace P, convex and found exactly (`pairs`, `line`, `simplex`).
+"""
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from fusion_service.arrays import Bools, Floats
+from fusion_service.linalg import inner
+from fusion_service.rules.base.block import Result, Sources, weighted_product
+from fusion_service.rules.base.matrices import diagonal, weighted_sum
+from fusion_service.rules.base.options import CRITERION
+from fusion_service.rules.base.rule import Rule
+from fusion_service.rules.base.scales import SCALES, in_scales
+from fusion_service.rules.weights import simplex
+from fusion_service.rules.weights.two import best_of_two
+
+__all__ = ["RULE", "ci", "intersection"]
+
+
+def ci(sources: Sources, weights: Floats | None, influence: bool, *, criterion: str) -> Result:
+    """Covariance intersection."""
+    return intersection(sources, weights, influence, criterion, 1.0)
+
+
+RULE = Rule(
+    name="ci",
+    order=2,
+    title="covariance intersection; weights by det or trace, exactly optimal, or given",
+    promise="conservative for every correlation",
+    source="covariance intersection (Julier and Uhlmann 1997; Sharma (4); Li-AA (16)-(18))",
+    fuse=in_scales(ci),
+    takes={"criterion": CRITERION, "scales": SCALES},
+)
+
+
+def intersection(sources: Sources, weights: Floats | None, influence: bool, criterion: str, rho: float) -> Result:
+    """The intersection of the sources inflated for correlations up to rho: CI for 1, the naive rule for 0."""
+    model = Inflated(sources.information, rho)
+    optimise = weights is None and rho > 0.0 and sources.count > 1
+    w = sources.uniform if weights is None else weights
+    if optimise and sources.count == 2:
+        A, P, dets = model.A, sources.covariances, 1.0 / sources.dets
+        ends = (A[:, :, 1], A[:, :, 0]), (P[:, :, 1], P[:, :, 0]), (dets[1], dets[0])
+        w = best_of_two(criterion, *ends, rho=rho)
+    elif optimise:
+        w = simplex.best_weights(criterion, model, w)
+    scale, slope, _ = model.scale(w)
+    mean, P, condition = weighted_product(sources, scale)
+    gap, share = np.zeros_like(condition), None
+    if optimise:
+        g = simplex.gradient(criterion, P, model.A)
+        gap = simplex.gap(w, g * slope)
+    if influence:
+        share = (-g if optimise and criterion == "det" else inner(P[:, :, None], model.A)) * scale / len(P)
+    return Result(mean, P, w, share, condition, gap)
+
+
+@dataclass(frozen=True, slots=True)
+class Inflated:
+    """M(w) = sum c(w_i) A_i, c(w) = w / ((1-rho) w + rho)."""
+
+    A: Floats  # (n, n, N, B)
+    rho: float
+
+    def scale(self, w: Floats) -> tuple[Floats, Floats | float, Floats | float]:
+        """c, c' and c''."""
+        if self.rho == 1.0:
+            return w, 1.0, 0.0
+        if self.rho == 0.0:
+            return np.ones_like(w), 0.0, 0.0
+        d = (1.0 - self.rho) * w + self.rho
+        slope = self.rho / (d * d)
+        return w / d, slope, -2.0 * (1.0 - self.rho) * slope / d
+
+    def __call__(self, w: Floats) -> tuple[Floats, Floats]:
+        c, slope, _ = self.scale(w)
+        return weighted_sum(self.A, c), self.A * slope
+
+    def bend(self, w: Floats, G: Floats) -> Floats | None:
+        if self.rho == 1.0:
+            return None
+        return diagonal(-self.scale(w)[2] * inner(G[:, :, None], self.A))
+
+    def take(self, index: Bools) -> Self:
+        return replace(self, A=self.A[..., index])
