@@ -152,21 +152,47 @@ class Identities:
     def contradicted(self, rows: Rows, linked: Ints, sure: Ints) -> Ints:
         """Of the linked rows those that are trusted to be another object than a row of the same track, which stays:
         one of `sure`, else one that says what the track is believed to be, else the one that was linked first."""
-        tracks, trust = rows.tracks, self._stated("identity_trust", rows.source[linked])
-        said = linked[(tracks.identity[linked] != NONE) & (trust >= TRUSTED)]
-        code, link = tracks.identity[said], tracks.link[said]
+        said, question, code = self._trusted(rows, linked)
         if not len(said):
             return said
-        question = self._intake.said.identity.schemes()[code]
+        link, since = rows.tracks.link[said], rows.tracks.since[said]
         at, best = self.identity.find(link, question), self.identity.best(OPEN)
         known = at >= 0
         unbelieved = np.ones(len(said), dtype=np.bool_)
         unbelieved[known] = (best[0][at[known]] != code[known]) | (best[1][at[known]] < TRUSTED)
-        order = np.lexsort((said, tracks.since[said], unbelieved, ~np.isin(said, sure), question, link))
+        order = np.lexsort((said, since, unbelieved, ~np.isin(said, sure), question, link))
         new = np.append(True, (np.diff(link[order]) != 0) | (np.diff(question[order]) != 0))
         stays = code[order][new][np.cumsum(new) - 1]
         odd: Ints = np.sort(said[order][code[order] != stays])
         return odd
+
+    def denied(self, rows: Rows, row: Ints, track: Ids) -> Mask:
+        """Of candidate pairs (row, global id), each (P,), those of which the row, and one linked to the track, are
+        trusted to be two objects."""
+        forbidden = np.zeros(len(row), dtype=np.bool_)
+        mine, asked, code = self._trusted(rows, row)
+        linked, question, said = self._trusted(rows, rows.linked())
+        if not len(mine) or not len(linked):
+            return forbidden
+        link, width = rows.tracks.link[linked], len(self._intake.said.identity.texts)
+        tracks = np.unique(link)
+        keys = np.searchsorted(tracks, link) * width + question
+        order = np.argsort(keys, kind="stable")
+        pairs = np.flatnonzero(np.isin(row, mine) & np.isin(track, tracks))
+        place = np.searchsorted(mine, row[pairs])
+        wanted = np.searchsorted(tracks, track[pairs]) * width + asked[place]
+        at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
+        forbidden[pairs] = (keys[order][at] == wanted) & (said[order][at] != code[place])
+        return forbidden
+
+    def _trusted(self, rows: Rows, some: Ints) -> tuple[Ints, Codes, Codes]:
+        """Of some rows those that have an identity from a source that is trusted, in order, and each its question and
+        its answer."""
+        some = np.unique(some)
+        trust = self._stated("identity_trust", rows.source[some])
+        some = some[(rows.tracks.identity[some] != NONE) & (trust >= TRUSTED)]
+        code = rows.tracks.identity[some]
+        return some, self._intake.said.identity.schemes()[code], code
 
     def row_terms(self, rows: Rows, i: Ints, j: Ints) -> Terms:
         """For pairs of rows (i, j), each (P,)."""

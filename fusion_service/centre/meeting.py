@@ -55,11 +55,13 @@ class Meeting:
 
     def _unwanted(self) -> Ints:
         """The rows whose standing links an order forbids, or another row of the track that is trusted to be another
-        object. Of two rows that are never to be together the second leaves."""
+        object. Of two rows that are never to be together the second leaves, unless it is linked by order."""
         linked, link, orders = self._rows.linked(), self._rows.tracks.link, self._orders
         together = (link[orders.apart_i] == link[orders.apart_j]) & (link[orders.apart_i] != NO_TRACK)
-        first = np.setdiff1d(orders.apart_i[together], orders.apart_j[together])
-        bad = orders.forbids(linked, link[linked]) & ~np.isin(linked, first)
+        i, j = orders.apart_i[together], orders.apart_j[together]
+        leaves = np.where(np.isin(j, self.forced_row), i, j)
+        stays = np.setdiff1d(np.concatenate([i, j]), leaves)
+        bad = orders.forbids(linked, link[linked]) & ~np.isin(linked, stays)
         odd = self._identities.contradicted(self._rows, linked, self.forced_row)
         bad |= np.isin(linked, odd)
         return linked[bad & ~np.isin(linked, self.forced_row)]
@@ -68,7 +70,8 @@ class Meeting:
         """Of P pairs of a row and a global track (its place in `ids`): the log-likelihood ratio, by what they are said
         to be, of one object to two, and which are forbidden."""
         terms = self._identities.terms(self._rows, row, self._ids[at])
-        forbidden = terms.forbidden | (self.compartment_of_rows[row] != self.compartment_of_tracks[at])
+        forbidden = terms.forbidden | self._identities.denied(self._rows, row, self._ids[at])
+        forbidden |= self.compartment_of_rows[row] != self.compartment_of_tracks[at]
         return Terms(terms.ratio, forbidden | self._orders.forbids(row, self._ids[at]))
 
     def with_rows(self, i: Ints, j: Ints) -> Terms:

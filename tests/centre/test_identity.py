@@ -175,6 +175,32 @@ def test_different_trusted_identities_are_never_joined() -> None:
     assert result.tracks.ids.tolist() == [1, 2]
 
 
+@pytest.mark.parametrize("first", ["r1", "r2", "both"])
+def test_tracks_that_turn_out_to_be_two_objects_part_at_once(first: str) -> None:
+    """Joined while nobody said what they are; then both do, one before the other or in the same step."""
+    made = centre(("r1", "r2"))
+    names = {"r1": ("mmsi:1",), "r2": ("mmsi:2",)}
+    for second in range(1, 12):
+        speaks = {name for name in names if second > (3 if name == first or first == "both" else 6)}
+        for name, place in (("r1", HERE), ("r2", NEAR)):
+            give(made, tracks(name, second, place, identity=names[name] if name in speaks else None, ids=[1]))
+        result = step(made, second)
+        parted = len(speaks) == 2
+        assert result.tracks.contributor_counts.tolist() == ([1, 1] if parted else [2]), second
+    stays = "r2" if first == "r2" else "r1"
+    said = dict(zip(result.tracks.ids.tolist(), of(result, "identity"), strict=True))
+    assert said == {1: names[stays][0], 2: names[{"r1": "r2", "r2": "r1"}[stays]][0]}
+
+
+def test_a_source_alone_that_corrects_itself_keeps_its_track() -> None:
+    made = centre(("r1",))
+    for second in range(1, 12):
+        give(made, tracks("r1", second, HERE, identity=("mmsi:1" if second < 6 else "mmsi:2",), ids=[1]))
+        result = step(made, second)
+        assert result.tracks.ids.tolist() == [1]
+    assert of(result, "identity") == ["mmsi:2"]
+
+
 def test_identities_of_different_schemes_do_not_contradict() -> None:
     made = centre(("r1", "r2"))
     for second in range(1, 4):

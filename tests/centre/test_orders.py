@@ -18,7 +18,7 @@ from fusion_service.centre.orders import Orders
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import empty_tracks
 from fusion_service.order import order_event
-from schemas.messages import APART, IDENTITY_ORDERED
+from schemas.messages import APART, BROKEN, IDENTITY_ORDERED
 from tests.centre.worlds import START, centre, give, info, moved, step, tracks, truth
 
 PLACES = np.array([[0.0, 0.0, 0.0, 0.0], [5000.0, 0.0, 0.0, 0.0], [0.0, 8000.0, 0.0, 0.0]])
@@ -194,6 +194,45 @@ def test_a_link_overrules_what_kept_them_apart_and_the_other_way_round(world: Wo
     world.go(seconds=4)
     assert world.feeders(track) == {("r1", 1)}
     assert [one["what"] for one in world.centre.orders.listed()] == ["never-link"]
+
+
+def decided(result: StepResult, kind: int) -> list[tuple[str, int]]:
+    """The local tracks of which this was decided."""
+    one = result.log.decisions
+    some = one.kind == kind
+    return [(result.log.sources[k], i) for k, i in zip(one.source[some].tolist(), one.id[some].tolist(), strict=True)]
+
+
+@pytest.mark.parametrize("ordered", [False, True])
+def test_an_ordered_link_stands_against_all_evidence_and_is_left_out_while_it_fails(ordered: bool) -> None:
+    """r2's track of the first target wanders off 3 km for half a minute, while another of r2 comes up at the target."""
+    world = World()
+    world.go(seconds=12)
+    [track] = world.at(0)
+    if ordered:
+        world.go(Order("link", track=track, local=LocalId("r2", -1, 11)))
+    broken: list[tuple[str, int]] = []
+    for _ in range(30):
+        world.second += 1
+        away, there = PLACES + np.array([0.0, 3000.0, 0.0, 0.0]), PLACES[[1, 2, 0]]
+        own = tracks("r1", world.second, PLACES)
+        give(world.centre, own, tracks("r2", world.second, np.concatenate([away[:1], there]), [11, 12, 13, 99]))
+        world.results.append(step(world.centre, world.second))
+        broken += decided(world.results[-1], BROKEN)
+        assert ("r2", 11) not in world.feeders(track)
+    assert broken == ([] if ordered else [("r2", 11)])
+    assert world.feeders(track) == ({("r1", 1)} if ordered else {("r1", 1), ("r2", 99)})
+    world.go()
+    assert world.feeders(track) == {("r1", 1), ("r2", 11)}
+
+
+def test_a_link_that_an_order_forbids_is_broken_at_once_whoever_made_it() -> None:
+    world = World()
+    world.go(seconds=4)
+    orders = Order("never-link", local=LocalId("r1", -1, 3), against=LocalId("r2", -1, 13))
+    world.go(orders, Order("link", track=3, local=LocalId("r2", -1, 13)), seconds=2)
+    assert world.feeders(3) == {("r2", 13)}, "what is ordered to be linked stays, the other one leaves"
+    assert decided(world.results[-2], BROKEN) == [("r1", 3)]
 
 
 def test_names_and_identity_go_out_and_follow_a_merge(world: World) -> None:

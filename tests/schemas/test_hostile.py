@@ -252,7 +252,7 @@ def doubles(*values: float) -> bytes:
         ("global_tracks", {"contributor_counts": struct.pack("<3H", 65535, 1, 0)}, "length"),
         ("global_tracks", {"ended": [[1, "gone"]]}, "bad-field"),
         ("global_tracks", {"split_from": [[1, -1]]}, "bad-field"),
-        ("step_log", {"decision_kind": b"\x00\x01\x02\x0a"}, "bad-field"),
+        ("step_log", {"decision_kind": b"\x00\x01\x02\x0b"}, "bad-field"),
         ("step_log", {"decision_kind": b"\x00\x01\x02"}, "length"),
         ("step_log", {"decision_source": struct.pack("<4H", 0, 1, 2, 65535)}, "bad-field"),
         ("step_log", {"taken": [["radar-1", 1, 2, 3, ""]]}, "bad-field"),
