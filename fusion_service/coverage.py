@@ -6,9 +6,9 @@ import numpy as np
 
 from fusion_service.arrays import Bools, Floats
 from fusion_service.geodesy import FrameError, transform
-from schemas import Disk, Frame, Sector, SensorInfo
+from schemas import Coverage, Disk, Frame, Sector, SensorInfo
 
-__all__ = ["covers"]
+__all__ = ["covers", "region_holds"]
 
 
 def covers(info: SensorInfo, positions: Floats, frame: Frame) -> Bools:
@@ -24,16 +24,21 @@ def covers(info: SensorInfo, positions: Floats, frame: Frame) -> Bools:
         means, _ = transform(positions.T, np.zeros((count, len(axes), len(axes))), axes, frame, info.frame)
     except FrameError:
         return np.zeros(count, dtype=np.bool_)
-    x, y = means[:, 0], means[:, 1]
-    if isinstance(info.coverage, (Disk, Sector)):
-        east, north = x - info.position[0], y - info.position[1]
+    return region_holds(info.coverage, means.T, info.position[:2])
+
+
+def region_holds(region: Coverage, positions: Floats, centre: tuple[float, ...] = (0.0, 0.0)) -> Bools:
+    """Which places (2 or 3, M), m, lie in a region of the same frame; a disk or sector is about `centre`: (M,)."""
+    x, y = positions[0], positions[1]
+    if isinstance(region, (Disk, Sector)):
+        east, north = x - centre[0], y - centre[1]
         distance = np.hypot(east, north)
-        inside = (distance >= info.coverage.inner) & (distance <= info.coverage.radius)
-        if isinstance(info.coverage, Sector):
-            off = np.arctan2(east, north) - info.coverage.azimuth
-            inside &= np.abs(np.arctan2(np.sin(off), np.cos(off))) <= info.coverage.width / 2
+        inside = (distance >= region.inner) & (distance <= region.radius)
+        if isinstance(region, Sector):
+            off = np.arctan2(east, north) - region.azimuth
+            inside &= np.abs(np.arctan2(np.sin(off), np.cos(off))) <= region.width / 2
         return np.asarray(inside)
-    return _in_polygon(info.coverage.points, x, y)
+    return _in_polygon(region.points, x, y)
 
 
 def _in_polygon(points: tuple[tuple[float, float], ...], x: Floats, y: Floats) -> Bools:

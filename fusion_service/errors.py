@@ -10,6 +10,7 @@ FusionError                           1  the root; in `schemas.errors`, for `sch
   StateError                          1  fusion_service.service.state: the folder of ids and checkpoint
   CheckpointError         ValueError  1  fusion_service.centre.checkpoint: a checkpoint that cannot be gone on from
   DemoError                           1  fusion_service.demo: a mission that cannot be flown, or went wrong
+  OrderError                          1  an order that a centre refuses, or that no centre hears
   ReviewError             ValueError  1  a recording, or what was asked of it
     NothingToScoreError               1  fusion_service.review.evaluation: nothing in it can be scored
   DataError               ValueError  1  recorded data of a sensor: a file that is not as it must be
@@ -31,7 +32,7 @@ from typing import ClassVar
 
 from schemas.errors import FusionError, MessageError
 
-__all__ = ["DataError", "FusionError", "MessageError", "ReviewError", "Stopped", "UsageError"]
+__all__ = ["DataError", "FusionError", "MessageError", "OrderError", "ReviewError", "Stopped", "UsageError"]
 
 
 class Stopped(FusionError):
@@ -44,6 +45,10 @@ class UsageError(FusionError):
     """A command cannot be carried out as it was typed; the message says how to mend it."""
 
     exit_code: ClassVar[int] = 2
+
+
+class OrderError(FusionError):
+    """An order that a centre does not obey; the message says why, in one line."""
 
 
 class ReviewError(FusionError, ValueError):

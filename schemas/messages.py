@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from schemas.spaces import Coverage, Frame, Height, Motion
 
 __all__ = [
+    "APART",
     "BORN",
     "BROKEN",
     "COASTING",
@@ -27,8 +28,11 @@ __all__ = [
     "DELETED",
     "EXCHANGED",
     "GATE_FAILED",
+    "IDENTITY_ORDERED",
+    "IDENTITY_TWICE",
     "KEPT",
     "LINKED",
+    "MARKS",
     "MERGED",
     "NO_SOURCE",
     "ORIGINS",
@@ -53,12 +57,16 @@ __all__ = [
 Floats: TypeAlias = NDArray[np.float64]
 U64: TypeAlias = NDArray[np.uint64]
 I64: TypeAlias = NDArray[np.int64]
+U32: TypeAlias = NDArray[np.uint32]
 U16: TypeAlias = NDArray[np.uint16]
 U8: TypeAlias = NDArray[np.uint8]
 
 ORIGINS = ("live", "exercise", "simulated", "replay")
 STATUSES = ("tentative", "confirmed", "coasting")
 TENTATIVE, CONFIRMED, COASTING = range(3)
+MARKS = ("apart", "identity_twice", "identity_ordered")
+APART, IDENTITY_TWICE, IDENTITY_ORDERED = (1 << bit for bit in range(3))
+"""Bits of a global track's marks: of a source in quarantine; its identity is in two places; an operator gave it."""
 
 DECISIONS = (
     "linked",
@@ -167,6 +175,9 @@ class GlobalTracks(Header):
     that the contributions index; contributor_counts (T,) u16 says how many of the K contributions each
     track has: source (index, u16), epoch and local id (u64), influence trace(K_i)/n of the gain K_i.
     ended: (id, reason, id of the track that replaces it or None); split_from: (new id, old id).
+    identity, kind: what it is, a text or None per track, with the probabilities identity_p and kind_p (T,);
+    track_origin (T,) u8 index into `ORIGINS`; marks (T,) u8, bits of `MARKS`; number (T,) u32 and callsign: how
+    an operator has named it (0, None: not).
     """
 
     type: ClassVar[str] = "global_tracks"
@@ -191,6 +202,14 @@ class GlobalTracks(Header):
     weights: Floats | None = None
     ended: tuple[tuple[int, str, int | None], ...] = ()
     split_from: tuple[tuple[int, int], ...] = ()
+    identity: tuple[str | None, ...] | None = None
+    identity_p: Floats | None = None
+    kind: tuple[str | None, ...] | None = None
+    kind_p: Floats | None = None
+    track_origin: U8 | None = None
+    marks: U8 | None = None
+    number: U32 | None = None
+    callsign: tuple[str | None, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

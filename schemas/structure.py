@@ -14,6 +14,7 @@ from schemas.errors import MessageError
 from schemas.messages import (
     DECISIONS,
     NO_SOURCE,
+    ORIGINS,
     STATUSES,
     U64,
     Decisions,
@@ -117,6 +118,7 @@ def _global(values: Values) -> None:
     tracks = len(ids)
     _unique(ids)
     _lengths(values, tracks, "status", "existence", "updated", "contributor_counts")
+    _lengths(values, tracks, "identity", "identity_p", "kind", "kind_p", "track_origin", "marks", "number", "callsign")
     contributions = int(values["contributor_counts"].sum(dtype=np.int64))
     parts = ("source", "epoch", "id", "influence")
     _lengths(values, contributions, *(f"contributor_{part}" for part in parts))
@@ -124,6 +126,8 @@ def _global(values: Values) -> None:
         raise MessageError("bad-field", "contributor_source: beyond sources")
     if tracks and values["status"].max() >= len(STATUSES):
         raise MessageError("bad-field", f"status: beyond {len(STATUSES) - 1}")
+    if values["track_origin"] is not None and tracks and values["track_origin"].max() >= len(ORIGINS):
+        raise MessageError("bad-field", f"track_origin: beyond {len(ORIGINS) - 1}")
     _densities(values, _components(values, tracks))
 
 

@@ -5,24 +5,34 @@ from fusion_service.centre.checkpoint import CheckpointError
 from fusion_service.centre.clock import MessageClock, WallClock
 from fusion_service.centre.era import ClockSet, NewEra
 from fusion_service.centre.fusion import FusionCentre
-from fusion_service.centre.intake import Event, Order, Refused, SourceFound, SourceLost
+from fusion_service.centre.intake import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.intensity import IntensityCentre
+from fusion_service.centre.judging import Outcome, View, judge
 from fusion_service.centre.making import make_centre
+from fusion_service.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
 
 __all__ = [
+    "NEEDED",
+    "WHAT",
     "Centre",
     "CheckpointError",
     "ClockSet",
     "Event",
     "FusionCentre",
     "IntensityCentre",
+    "LocalId",
     "MessageClock",
     "NewEra",
     "Order",
+    "Outcome",
     "Refused",
     "SourceFound",
     "SourceLost",
     "StepResult",
+    "View",
     "WallClock",
+    "judge",
     "make_centre",
+    "order_of",
+    "read_order",
 ]

@@ -15,8 +15,9 @@ from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
 from fusion_service.densities import Mixtures
+from fusion_service.metrics import chi2_quantile
 from fusion_service.motion import predict
-from schemas import ORIGINS, Entry, Motion
+from schemas import Entry, Motion
 
 __all__ = ["predict_tracks", "usable_rows", "write_back"]
 
@@ -33,7 +34,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     starts: list[NDArray[np.bool_]] = []
     interval: list[NDArray[np.int64]] = []
     lost: list[NDArray[np.bool_]] = []
-    origin: list[NDArray[np.int64]] = []
+    gates: list[NDArray[np.float64]] = []
     kept: dict[str, int] = {}
     room = MAX_TOTAL // max(len(intake.sources), 1)
     for number, (name, source) in enumerate(sorted(intake.sources.items())):
@@ -55,7 +56,8 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         starts.append(np.full(count, said.may_start, dtype=np.bool_))
         interval.append(table.interval[sound])
         lost.append(np.full(count, source.alive is False, dtype=np.bool_))
-        origin.append(np.full(count, ORIGINS.index(source.origin), dtype=np.int64))
+        gate = config.gate if said.gate is None else said.gate
+        gates.append(np.full(count, chi2_quantile(gate, len(config.space))))
     if not parts:
         parts.append(intake.nothing())
     tracks = join_tracks(parts)
@@ -66,7 +68,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         may_start=_joined(starts, np.bool_),
         interval=_joined(interval, np.int64),
         lost=_joined(lost, np.bool_),
-        origin=_joined(origin, np.int64),
+        gate=_joined(gates, np.float64),
         fresh=tracks.updated > tracks.judged,
         kept=kept,
     )

@@ -13,13 +13,13 @@ __all__ = ["group"]
 Ints = NDArray[np.intp]
 
 
-def group(at: Ints, source: Ints, pairs: Pairs, gate: float) -> Ints:
+def group(at: Ints, source: Ints, pairs: Pairs, gate: NDArray[np.float64]) -> Ints:
     """The group (A,) of each of the rows `at`, which are in order: 0, 1, ... by the first row of each.
 
     At most one row of each source is in a group, each two within the gate. Sources come one after the other; the rows
     of each are given to the groups so far by the optimal assignment of the mean of d2 + log det to their members, where
-    staying apart costs the gate; for two sources that is the best of all groupings. source: (M,) of all rows, `pairs`
-    of rows, (first, second) in order.
+    staying apart costs the gate (M,), of two the wider; for two sources that is the best of all groupings. source:
+    (M,) of all rows, `pairs` of rows, (first, second) in order.
     """
     label = np.full(len(source), -1, dtype=np.intp)
     mine = np.zeros(len(source), dtype=np.bool_)
@@ -27,7 +27,7 @@ def group(at: Ints, source: Ints, pairs: Pairs, gate: float) -> Ints:
     some = mine[pairs.first] & mine[pairs.second]
     first, second = pairs.first[some], pairs.second[some]
     top = pairs.spread[some].max(initial=-np.inf)
-    gain = 1e-6 + (gate - pairs.distance[some]) + (top - pairs.spread[some])
+    gain = 1e-6 + (np.maximum(gate[first], gate[second]) - pairs.distance[some]) + (top - pairs.spread[some])
     size = np.zeros(len(at), dtype=np.intp)
     count = 0
     for name in np.unique(source[at]).tolist():

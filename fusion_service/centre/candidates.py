@@ -7,7 +7,8 @@ with a track as that track is without the row's own source, so that no source vo
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from fusion_service import linalg
 from fusion_service.centre.association import candidate_pairs, overlap, pair_distance
 from fusion_service.centre.gating import Judgement
+from fusion_service.centre.identity import Terms
 from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.densities import Mixtures
 
@@ -57,42 +60,64 @@ class Candidates:
 
 
 def find_candidates(
-    rows: Rows, now: Picture, judged: Judgement, gate: float, places: list[int], mixed_origins: bool
+    rows: Rows, now: Picture, meeting: Meeting, judged: Judgement, gate: float, places: list[int]
 ) -> Candidates:
-    """All of them. now: the picture predicted to the step."""
+    """All that may meet. now: the picture predicted to the step."""
     tracks, agreed = rows.tracks, judged.agreed
     mean, covariance = now.mean.copy(), now.covariance.copy()
     at = now.find(agreed.labels)
     mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
-    loose = np.flatnonzero(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside))
+    loose = np.flatnonzero(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
     known = np.flatnonzero(now.time >= 0)
     means = np.concatenate([mean[:, known], tracks.mean[:, loose]], axis=1)
     covariances = np.concatenate([covariance[:, :, known], tracks.covariance[:, :, loose]], axis=2)
     source = np.concatenate([np.full(len(known), -1), rows.source[loose]])
-    origin = np.concatenate([now.origin[known], rows.origin[loose]])
+    compartment = np.concatenate([meeting.compartment_of_tracks[known], meeting.compartment_of_rows[loose]])
     sigma = np.sqrt(sum(covariances[place, place] for place in places))
-    i, j = candidate_pairs(means[places], sigma, float(np.sqrt(gate)), source)
-    if not mixed_origins:
-        same = origin[i] == origin[j]
-        i, j = i[same], j[same]
+    gates = np.concatenate([np.full(len(known), gate), rows.gate[loose]])
+    i, j = candidate_pairs(means[places], sigma, float(np.sqrt(gates.max(initial=gate))), source)
+    same = compartment[i] == compartment[j]
+    i, j = i[same], j[same]
     first_row, second_row = i >= len(known), j >= len(known)
     node = np.concatenate([known, loose])
     both, none = ~second_row, first_row
     parts = _mixtures(now, known, rows, loose)
-    pairs_gg = _gated(means, covariances, i[both], j[both], gate, parts)
-    pairs_rr = _gated(means, covariances, i[none], j[none], gate, parts)
+    pairs_gg = _gated(means, covariances, i[both], j[both], gates, parts)
+    pairs_rr = _gated(means, covariances, i[none], j[none], gates, parts)
     mixed = ~both & ~none
     lookup = _Without(rows, now, judged, mean, covariance)
     row, track = node[j[mixed]], node[i[mixed]]
-    joins = lookup.pairs(row, track, gate, _own_mixtures(now, rows))
+    joins = lookup.pairs(row, track, _own_mixtures(now, rows))
     row, track = _near_own(rows, now, judged.inside, pairs_gg, known)
-    rivals = lookup.pairs(row, track, gate, None)
+    rivals = lookup.pairs(row, track, None)
     own = np.full(len(tracks.id), np.nan)
     mine = np.unique(rivals.first)
     own[mine] = lookup.cost(mine, now.find(tracks.link[mine]))
     gg = Pairs(known[pairs_gg.first], known[pairs_gg.second], pairs_gg.distance, pairs_gg.spread)
     rr = Pairs(node[pairs_rr.first], node[pairs_rr.second], pairs_rr.distance, pairs_rr.spread)
-    return Candidates(gg, joins, rivals, rr, own, loose, mean, covariance)
+    return _said(Candidates(gg, joins, rivals, rr, own, loose, mean, covariance), rows, now, meeting)
+
+
+def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candidates:
+    """Those of them that orders and identities allow, and what these say of one target against two counted as the
+    states are: minus twice the log-likelihood ratio in what a pair costs."""
+    own = near.own.copy()
+    mine = np.flatnonzero(np.isfinite(own))
+    own[mine] -= 2.0 * meeting.with_tracks(mine, now.find(rows.tracks.link[mine])).ratio
+    joins, rivals = (pairs.take(~np.isin(pairs.first, meeting.forced_row)) for pairs in (near.joins, near.rivals))
+    return replace(
+        near,
+        tracks=near.tracks.take(~meeting.of_tracks(near.tracks.first, near.tracks.second)),
+        joins=_allowed(joins, meeting.with_tracks),
+        rivals=_allowed(rivals, meeting.with_tracks),
+        births=_allowed(near.births, meeting.with_rows),
+        own=own,
+    )
+
+
+def _allowed(pairs: Pairs, say: Callable[[Ints, Ints], Terms]) -> Pairs:
+    terms = say(pairs.first, pairs.second)
+    return replace(pairs, spread=pairs.spread - 2.0 * terms.ratio).take(~terms.forbidden)
 
 
 class _Without:
@@ -134,8 +159,8 @@ class _Without:
         distance, spread = self._distances(row, track)
         return distance + spread
 
-    def pairs(self, row: Ints, track: Ints, gate: float, mixtures: tuple[Mixtures, Mixtures] | None) -> Pairs:
-        """Those of the pairs that are within the gate, in order; of mixtures the d2 of their nearest components."""
+    def pairs(self, row: Ints, track: Ints, mixtures: tuple[Mixtures, Mixtures] | None) -> Pairs:
+        """Those of the pairs within the gate of the row, in order; of mixtures the d2 of their nearest components."""
         order = np.lexsort((track, row))
         row, track = row[order], track[order]
         distance, spread = self._distances(row, track)
@@ -145,16 +170,16 @@ class _Without:
             several |= np.isfinite(its.log_weights).sum(axis=0)[track] > 1
             at = np.flatnonzero(several)
             distance[at], spread[at] = overlap(mine.take(row[at]), its.take(track[at]))
-        return Pairs(row, track, distance, spread).take(distance <= gate)
+        return Pairs(row, track, distance, spread).take(distance <= self._rows.gate[row])
 
 
-def _gated(means: Floats, covariances: Floats, i: Ints, j: Ints, gate: float, parts: Mixtures | None) -> Pairs:
+def _gated(means: Floats, covariances: Floats, i: Ints, j: Ints, gates: Floats, parts: Mixtures | None) -> Pairs:
     distance, spread = pair_distance(means, covariances, i, j)
     if parts is not None:
         several = np.isfinite(parts.log_weights).sum(axis=0) > 1
         at = np.flatnonzero(several[i] | several[j])
         distance[at], spread[at] = overlap(parts.take(i[at]), parts.take(j[at]))
-    return Pairs(i, j, distance, spread).take(distance <= gate)
+    return Pairs(i, j, distance, spread).take(distance <= np.maximum(gates[i], gates[j]))
 
 
 def _near_own(rows: Rows, now: Picture, inside: Ints, near: Pairs, known: Ints) -> tuple[Ints, Ints]:

@@ -23,13 +23,18 @@ from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
 from fusion_service.centre.ids import Ids
-from fusion_service.centre.intake import Event, Intake, Order
+from fusion_service.centre.intake import Event, Intake
 from fusion_service.centre.journal import Journal, start_event
+from fusion_service.centre.judging import View
+from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import empty_picture
+from fusion_service.centre.obeying import heirs, obey, view_of
+from fusion_service.centre.orders import Orders
 from fusion_service.centre.publishing import Contributions, picture_message
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.status import step_status
 from fusion_service.config import CentreConfig, centre_config, config_hash
+from fusion_service.order import Order
 from schemas import GlobalTracks, Status, StepLog, messages
 
 __all__ = ["Centre", "StepResult"]
@@ -66,6 +71,7 @@ class Centre(ABC):
         self.epoch = epoch
         self._intake = Intake(self.config)
         self._picture = empty_picture(len(self.config.space))
+        self._labels = Labels(self._intake)
         self._ids = Ids()
         self._step = 0
         self._published = 0
@@ -74,7 +80,7 @@ class Centre(ABC):
         self._era = EraWatch(self.config)
         self._begin()
         if checkpoint is not None:
-            state, self._picture = unpack_state(checkpoint, self._intake)
+            state, self._picture = unpack_state(checkpoint, self._intake, self._labels)
             self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
             self._era.unpack(state["era"])
             try:
@@ -104,6 +110,7 @@ class Centre(ABC):
         self._journal.event(self._era.begin(time, self._time))
         self._time = time
         self._intake.rebase(time, now)
+        self._labels.rebase(time)
         self._picture = rebased(self._picture, GLOBAL_TIMES, time)
 
     def step(self, time: int) -> StepResult:
@@ -112,7 +119,8 @@ class Centre(ABC):
             raise ValueError(f"a step at {time} is not after the last, at {self._time}")
         self._step += 1
         journal = self._journal
-        self._obey(self._intake.admit(time, self._time, journal))
+        self._obey(self._intake.take_orders(), time)
+        self._intake.admit(time, self._time, journal)
         self._time = time
         if self._intake.reframed:
             self._intake.reframed = False
@@ -121,11 +129,15 @@ class Centre(ABC):
         names = self._intake.names()
         journal.name_sources(names)
         contributions = self._advance(rows, names, time)
+        gone_on = heirs(journal.ended())
+        self._intake.orders.follow(gone_on)
+        self._labels.follow(rows, self._picture, names, gone_on, time, journal)
         tracks = picture_message(
             self._picture,
             self._intake,
             journal,
             contributions,
+            self._labels,
             epoch=self.epoch,
             seq=self._published,
             step=self._step,
@@ -141,6 +153,15 @@ class Centre(ABC):
         """Refusals by reason since the start, those included that no step has told yet."""
         return dict(sorted((self._journal.refused + self._intake.waiting_refusals()).items()))
 
+    @property
+    def orders(self) -> Orders:
+        """The orders that stand."""
+        return self._intake.orders
+
+    def view(self) -> View:
+        """What orders are judged by now, as it is: no copy that later steps leave alone."""
+        return view_of(self._intake, self._picture, self._time)
+
     def checkpoint(self) -> bytes:
         """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""
         state = {
@@ -151,7 +172,7 @@ class Centre(ABC):
             "era": self._era.pack(),
             "own": self._kept(),
         }
-        return pack_state(self.config_hash, state, self._intake, self._picture)
+        return pack_state(self.config_hash, state, self._intake, self._labels, self._picture)
 
     @staticmethod
     @abstractmethod
@@ -183,11 +204,11 @@ class Centre(ABC):
     def _forget(self, tracks: Iterable[int]) -> None:
         """Undo whatever refers to global tracks that are no more."""
 
-    def _obey(self, orders: list[Order]) -> None:
-        doomed = [order.track for order in orders if order.what == "delete" and order.track is not None]
-        doomed = [track for track in doomed if 0 < track < 2**64]
-        if doomed:
-            self._end_all(np.array(doomed, dtype=np.uint64), "ordered")
+    def _obey(self, orders: list[Order], time: int) -> None:
+        obeyed = obey(orders, self._intake, self._picture, self._ids, self._journal, time, self._step)
+        self._picture = obeyed.picture
+        if obeyed.gone:
+            self._forget(obeyed.gone)
 
     def _end_all(self, tracks: NDArray[np.uint64], reason: str) -> None:
         """End those of these global tracks that there are."""
@@ -199,4 +220,5 @@ class Centre(ABC):
 
     def _numbers(self) -> dict[str, int]:
         kinds = Counter(self._picture.status.tolist())
-        return {name: kinds.get(code, 0) for code, name in enumerate(messages.STATUSES)}
+        counts = {name: kinds.get(code, 0) for code, name in enumerate(messages.STATUSES)}
+        return counts | self._labels.numbers()

@@ -18,23 +18,31 @@ from fusion_service.centre.intervals import NOTHING_REMEMBERED, Remembered
 from fusion_service.centre.lifecycle import Picture, empty_picture
 from fusion_service.centre.restoring import fit_config
 from fusion_service.centre.sources import Source, Tracks, empty_tracks, padded
+from fusion_service.centre.words import Lexicon, Words
 from fusion_service.errors import FusionError
+from fusion_service.order import Order
 from schemas import Ecef, Enu, Frame, Local, SensorInfo, decode, encode
 
 if TYPE_CHECKING:
     from fusion_service.centre.intake import Intake
+    from fusion_service.centre.labels import Labels
 
 __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
 
 CHECKPOINT_VERSION = 2
 READABLE = (1, 2)
-NEVER = ("since", "used", "judged", "weighed", "seen", "last_hit", "due")
-"""Columns of times that may not be in a checkpoint of an earlier release."""
+MISSING: dict[str, float] = {
+    **dict.fromkeys(("since", "used", "judged", "weighed", "seen", "told", "last_hit", "due"), -1),
+    "identity": -1,
+    "kind": -1,
+    "kind_p": np.nan,
+}
+"""What columns hold that may not be in a checkpoint of an earlier release; others hold 0."""
 _PLAIN = (
     *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
-    *("origin", "waited", "highest", "first", "interval", "ordered", "why", "unused"),
+    *("origin", "waited", "highest", "first", "interval", "why", "unused"),
 )
-_LATER = ("interval", "ordered", "why", "unused")
+_LATER = ("interval", "why", "unused")
 """What a checkpoint of an earlier release does not hold."""
 NO_ERA = (0, -1, -1, 0, -1, -1)
 Columns = TypeVar("Columns", Tracks, Picture)
@@ -44,7 +52,7 @@ class CheckpointError(FusionError, ValueError):
     """A checkpoint that cannot be used, and why, in one line."""
 
 
-def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, picture: Picture) -> bytes:
+def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: Labels, picture: Picture) -> bytes:
     """The bytes of a checkpoint."""
     whole = {
         "v": CHECKPOINT_VERSION,
@@ -54,13 +62,16 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, picture:
         "frame_asked": intake.voting.asked,
         "sources": {name: _pack_source(source) for name, source in sorted(intake.sources.items())},
         "picture": _pack_columns(picture),
+        "orders": intake.orders.kept(),
+        "labels": labels.kept(),
+        "said": [words.texts for words in intake.said],
         **state,
     }
     return cast(bytes, msgpack.packb(whole))
 
 
-def unpack_state(blob: bytes, intake: Intake) -> tuple[dict[str, Any], Picture]:
-    """Fill the intake, and return the rest and the picture, in the space and frame of the config.
+def unpack_state(blob: bytes, intake: Intake, labels: Labels) -> tuple[dict[str, Any], Picture]:
+    """Fill intake and labels, and return the rest and the picture, in the space and frame of the config.
     `CheckpointError` if it is of another kind of centre, or cannot be read."""
     try:
         whole = msgpack.unpackb(blob)
@@ -76,12 +87,27 @@ def unpack_state(blob: bytes, intake: Intake) -> tuple[dict[str, Any], Picture]:
         asked = int(whole.get("frame_asked", -1))
         era = [int(part) for part in whole.get("era", NO_ERA)]
         numbers = {name: int(whole[name]) for name in ("step", "time", "next_id")}
+        _restore_words(whole, sources, intake, labels)
     except CheckpointError:
         raise
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
+    intake.mute()
     return {**numbers, "era": era, "own": whole.get("own")}, picture
+
+
+def _restore_words(whole: dict[str, Any], sources: dict[str, Source], intake: Intake, labels: Labels) -> None:
+    """What was ordered and said. In a checkpoint of an earlier release a muted source is all there is of orders."""
+    intake.said = Lexicon(*(Words(texts) for texts in whole.get("said", [[], []])))
+    if "labels" in whole:
+        labels.restore(whole["labels"])
+    if "orders" in whole:
+        intake.orders.restore(whole["orders"])
+        return
+    for name, source in sorted(sources.items()):
+        if source.muted and not intake.config.source(name).ignore:
+            intake.orders.stand(intake.orders.numbered(Order("mute", name)))
 
 
 def _pack_source(source: Source) -> dict[str, Any]:
@@ -102,8 +128,6 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
     for plain in _PLAIN:
         if plain in packed or plain not in _LATER:
             setattr(source, plain, packed[plain])
-    if "ordered" in packed:
-        source.muted = bool(source.ordered)
     if "remembered" in packed:
         kinds = NOTHING_REMEMBERED
         columns = (_array(one, like) for one, like in zip(packed["remembered"], kinds, strict=True))
@@ -142,7 +166,7 @@ def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
     arrays = []
     for one in fields(like):
         empty = getattr(like, one.name)
-        blank = np.full(count, -1 if one.name in NEVER else 0, empty.dtype)
+        blank = np.full(count, MISSING.get(one.name, 0)).astype(empty.dtype)
         flat = blank if one.name not in packed else _array(packed[one.name], empty)
         arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)

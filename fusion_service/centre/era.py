@@ -29,7 +29,7 @@ SLACK = 5.0
 """Seconds of set-back, beyond `lateness` and two periods, that are waited for."""
 TOLD = 600
 """Seconds for which a change of era stands in the status."""
-LOCAL_TIMES = ("time", "updated", "used", "judged", "weighed", "seen")
+LOCAL_TIMES = ("time", "updated", "used", "judged", "weighed", "seen", "told")
 GLOBAL_TIMES = ("time", "updated", "seen", "born", "due", "last_hit")
 
 

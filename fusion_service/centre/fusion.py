@@ -15,8 +15,10 @@ from fusion_service.centre.existence import Entries, update_existence
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.lifecycle import Picture, Support
 from fusion_service.centre.linking import Linker
+from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import relinked
 from fusion_service.config import CentreConfig
 
 __all__ = ["FusionCentre"]
@@ -48,7 +50,7 @@ class FusionCentre(Centre):
         self._last = self._time
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
-        self._associate(rows, time)
+        self._associate(rows, names, time)
         self._picture, influence = fuse_all(rows, self._predicted(time), time, self.config, self._journal)
         self._live(rows, time)
         write_back(rows, self._intake)
@@ -64,13 +66,15 @@ class FusionCentre(Centre):
         old = np.array(sorted(new), dtype=np.uint64)
         to = np.array([new[track] for track in old.tolist()], dtype=np.uint64)
         for source in self._intake.sources.values():
-            link = source.tracks.link
-            at = np.minimum(np.searchsorted(old, link), len(old) - 1)
-            source.tracks = replace(source.tracks, link=np.where(old[at] == link, to[at], link))
+            at = np.flatnonzero(np.isin(source.tracks.link, old))
+            if len(at):
+                link = to[np.searchsorted(old, source.tracks.link[at])]
+                source.tracks = relinked(source.tracks, at, link, self._step)
 
-    def _associate(self, rows: Rows, time: int) -> None:
+    def _associate(self, rows: Rows, names: tuple[str, ...], time: int) -> None:
         now = self._predicted(time)
-        self._picture, merged = self._linker.link(rows, self._picture, now, self._step, time, self._journal)
+        meeting = Meeting(self._intake, self._labels, rows, now.id, names)
+        self._picture, merged = self._linker.link(rows, self._picture, now, meeting, self._step, time, self._journal)
         self._relink(merged)
         if merged:
             gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))

@@ -20,9 +20,10 @@ from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import set_links
 from schemas import messages
 
-__all__ = ["Judgement", "Settings", "judge", "manoeuvred", "unlink"]
+__all__ = ["Judgement", "Settings", "judge", "manoeuvred"]
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
@@ -63,9 +64,9 @@ def manoeuvred(space: tuple[str, ...], acceleration: float, seconds: Floats) -> 
     return spread
 
 
-def judge(rows: Rows, now: Picture, time: int, settings: Settings, journal: Journal) -> Judgement:
+def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings, journal: Journal) -> Judgement:
     """Judge the linked rows in the step at `time`, ns, writing their columns of links. now: the picture predicted
-    to it."""
+    to it; forced: rows whose links no evidence breaks."""
     tracks, linked, tests = rows.tracks, rows.linked(), settings.tests
     links = tracks.link[linked]
     fresh = rows.fresh[linked]
@@ -83,7 +84,8 @@ def judge(rows: Rows, now: Picture, time: int, settings: Settings, journal: Jour
     tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
     tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
     tracks.data[linked] += fresh
-    broken, was = _break(rows, linked, links, fresh, distance, predicted, tests, journal)
+    may = fresh & ~np.isin(linked, forced)
+    broken, was = _break(rows, linked, links, may, distance, predicted, tests, journal)
     stays = tracks.link[linked] != NO_TRACK
     shown = np.where(np.isnan(distance), np.where(outside, predicted, np.nan), distance)
     for kind, which in ((messages.KEPT, stays & ~outside), (messages.GATE_FAILED, stays & outside)):
@@ -161,24 +163,18 @@ def _newest_other(links: NDArray[np.uint64], updated: NDArray[np.int64]) -> NDAr
 
 
 def _break(
-    rows: Rows, linked: Ints, links: NDArray[np.uint64], fresh: Bools, distance: Floats, predicted: Floats,
+    rows: Rows, linked: Ints, links: NDArray[np.uint64], may: Bools, distance: Floats, predicted: Floats,
     tests: Tests, journal: Journal,
 ) -> tuple[Ints, NDArray[np.uint64]]:  # fmt: skip
-    """Break what the sums have decided; of one global track only the row farthest from its prediction."""
+    """Break what the sums have decided of the links that may break; of one global track only the row farthest from
+    its prediction."""
     tracks = rows.tracks
-    ripe = fresh & (tracks.evidence[linked] <= -tests.bound + 1e-9)
+    ripe = may & (tracks.evidence[linked] <= -tests.bound + 1e-9)
     shown = np.where(np.isnan(distance), predicted, distance)
-    worst = _worst(links, fresh, predicted, shown, tracks.since[linked], ripe)
+    worst = _worst(links, may, predicted, shown, tracks.since[linked], ripe)
     if len(worst):
         journal.broke(rows, linked[worst], links[worst], shown[worst])
         again = np.isin(links, links[worst])
         tracks.evidence[linked[again]] = np.maximum(tracks.evidence[linked[again]], 0.0)
-        unlink(rows, linked[worst])
+        set_links(tracks, linked[worst], NO_TRACK, -1)
     return linked[worst], links[worst]
-
-
-def unlink(rows: Rows, at: Ints) -> None:
-    """Forget the links of these rows."""
-    tracks = rows.tracks
-    tracks.link[at] = NO_TRACK
-    tracks.evidence[at], tracks.outside[at], tracks.data[at] = 0.0, False, 0

@@ -1,8 +1,8 @@
 """From queued events to sources with sound tracks: the border where every input is checked, once.
 
 Reasons of refusal, beside those of `schemas.MessageError` (what cannot be decoded) and `schemas.FAULTS` (bad
-numbers): type, muted, loop, future, old-epoch, repeat, late, space, frame, intensity (or tracks: what this centre
-does not fuse), length, bad-info, too-many-tracks, too-many-sources.
+numbers): type, muted, origin, loop, future, old-epoch, repeat, late, space, frame, intensity (or tracks: what this
+centre does not fuse), length, bad-info, too-many-tracks, too-many-sources.
 
 An intensity stands in its source's table as a complete scan: a track per component, its weight as existence.
 """
@@ -24,10 +24,13 @@ from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
 from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
-from fusion_service.centre.scans import Scan, as_tracks, fits, is_sound, size_of
-from fusion_service.centre.sources import Source, Tracks, empty_tracks, message_tracks
+from fusion_service.centre.orders import Orders
+from fusion_service.centre.scans import Scan, as_tracks, fits, is_sound, message_tracks, size_of
+from fusion_service.centre.sources import Source, Tracks, empty_tracks
+from fusion_service.centre.words import Lexicon, Words
 from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.geodesy import FrameError
+from fusion_service.order import Order
 from schemas import (
     FAULTS,
     Entry,
@@ -42,7 +45,7 @@ from schemas import (
     digest,
 )
 
-__all__ = ["MAX_TOTAL", "Event", "Intake", "Order", "Refused", "SourceFound", "SourceLost"]
+__all__ = ["MAX_TOTAL", "Event", "Intake", "Refused", "SourceFound", "SourceLost"]
 
 MAX_SOURCES = 1000
 MAX_TRACKS = 20_000
@@ -50,6 +53,8 @@ MAX_TOTAL = 50_000
 MAX_QUEUED = 50_000
 MAX_COMPONENTS = 500_000
 MAX_EVENTS = 10_000
+MAX_ORDERS = 1000
+"""Orders of one step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +69,6 @@ class SourceLost:
     """The source's liveliness token is gone: its tracks live on until they are stale."""
 
     source: str
-
-
-@dataclass(frozen=True, slots=True)
-class Order:
-    """An operator's order: `mute` or `unmute` a source, `delete` a global track."""
-
-    what: str
-    source: str = ""
-    track: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,7 +99,9 @@ class Intake:
         self._queue: list[_Queued] = []
         self._held: Counter[str] = Counter()
         self._components = 0
-        self._orders: list[Order] = []
+        self.orders = Orders()
+        self.said = Lexicon(Words(), Words())
+        self._given: list[Order] = []
         self._present: dict[str, bool] = {}
         self._refused: Counter[tuple[str, str, bool]] = Counter()
         self._dead: list[str] | None = None
@@ -115,8 +113,8 @@ class Intake:
             if event.source in self._present or len(self._present) < 2 * MAX_SOURCES:
                 self._present[event.source] = isinstance(event, SourceFound)
         elif isinstance(event, Order):
-            if len(self._orders) < MAX_EVENTS:
-                self._orders.append(event)
+            if len(self._given) < MAX_ORDERS:
+                self._given.append(event)
         elif isinstance(event, Refused):
             self._count(event.source, event.reason, max(event.count, 1), event.dropped)
         elif isinstance(event, (ClockSet, NewEra)):
@@ -190,8 +188,19 @@ class Intake:
         self.voting.asked = min(self.voting.asked, time)
         self._queue = [(event, min(received, now)) for event, received in self._queue]
 
-    def admit(self, time: int, last: int, journal: Journal) -> list[Order]:
-        """Take all that is queued up to `time`, in canonical order; later messages stay. Returns the orders.
+    def take_orders(self) -> list[Order]:
+        """The orders given since the last step, which are obeyed before anything else of it."""
+        given, self._given = self._given, []
+        return given
+
+    def mute(self) -> None:
+        """Refuse the sources that the config ignores or an order mutes, and no others."""
+        muted = self.orders.about("mute")
+        for name, source in self.sources.items():
+            source.muted = name in muted or self.config.source(name).ignore
+
+    def admit(self, time: int, last: int, journal: Journal) -> None:
+        """Take all that is queued up to `time`, in canonical order; later messages stay.
 
         last: time of the last step, or -1.
         """
@@ -203,12 +212,8 @@ class Intake:
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):
             (journal.drop if dropped else journal.refuse)(Entry(name, 0, 0, 0, reason, count))
-        orders, self._orders = self._orders, []
-        for order in orders:
-            self._order(order, journal)
         self._present, self._refused = {}, Counter()
         self._accept(self._due(time, journal), time, last, journal)
-        return orders
 
     def _due(self, time: int, journal: Journal) -> list[_Keyed]:
         queue, self._queue, self._components = self._queue, [], 0
@@ -236,26 +241,19 @@ class Intake:
         return due
 
     def _presence(self, name: str, found: bool, journal: Journal) -> None:
-        source = self._admitted(name)
+        source = self.admitted(name)
         if source is None:
             journal.refuse(Entry(name, 0, 0, 0, "too-many-sources"))
         elif source.alive is not found:
             source.alive = found
             journal.event({"kind": "found" if found else "lost", "source": name})
 
-    def _order(self, order: Order, journal: Journal) -> None:
-        journal.event({"kind": "order", "what": order.what, "source": order.source, "track": order.track})
-        if order.what in ("mute", "unmute"):
-            source = self._admitted(order.source)
-            if source is not None:
-                source.muted = source.ordered = order.what == "mute"
-
     def _new(self, name: str) -> Source:
         source = Source(name, self.config.space, self.nothing())
-        source.muted = self.config.source(name).ignore
+        source.muted = self.config.source(name).ignore or name in self.orders.about("mute")
         return source
 
-    def _admitted(self, name: str) -> Source | None:
+    def admitted(self, name: str) -> Source | None:
         """The source of that name, made if there is room: the longest silent dead one goes for it."""
         if name in self.sources:
             return self.sources[name]
@@ -279,7 +277,7 @@ class Intake:
             entry = Entry(name, epoch, seq, code)
             known = self.sources.get(name)
             reason = self._fault(known or self._new(name), message, code, time, last, received)
-            source = None if reason else known or self._admitted(name)
+            source = None if reason else known or self.admitted(name)
             if source is None:
                 journal.refuse(replace(entry, reason=reason or "too-many-sources"))
                 if known is not None:
@@ -307,6 +305,8 @@ class Intake:
             return "type"
         if source.muted:
             return "muted"
+        if message.origin not in self.config.source(source.name).allowed_origins:
+            return "origin"
         if self.config.name in (message.lineage or ()) or message.source == self.config.name:
             return "loop"
         holds = getattr(message, "time", -1)
@@ -375,7 +375,7 @@ class Intake:
             try:
                 if self.frame is None:
                     raise FrameError(notes.unfit(name_frame(first.frame), self.config.space))
-                new = message_tracks(messages, sound, self.frame, said.height, self.config.max_components)
+                new = message_tracks(messages, sound, self.frame, said.height, self.config.max_components, self.said)
                 new = loosened(new, first.space, said)
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))

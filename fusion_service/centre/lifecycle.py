@@ -33,7 +33,7 @@ class Picture:
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
     overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
-    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; origin i64, the code of all that is in it.
+    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of.
     """
 
     id: NDArray[np.uint64]
@@ -54,7 +54,6 @@ class Picture:
     existence: NDArray[np.float64]
     opinion: NDArray[np.float64]
     evidence: NDArray[np.float64]
-    origin: NDArray[np.int64]
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
@@ -78,7 +77,7 @@ def empty_picture(n: int) -> Picture:
     return newborn(np.zeros(0, dtype=np.uint64), n, 0)
 
 
-def newborn(ids: NDArray[np.uint64], n: int, time: int, origin: NDArray[np.int64] | None = None) -> Picture:
+def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
     """Tentative tracks without a density yet."""
     count = len(ids)
     parts = no_parts(n, count)
@@ -102,7 +101,6 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int, origin: NDArray[np.int64
         existence=np.ones(count),
         opinion=np.full(count, np.nan),
         evidence=np.zeros(count),
-        origin=np.zeros(count, dtype=np.int64) if origin is None else origin,
     )
 
 

@@ -22,11 +22,13 @@ from fusion_service import linalg
 from fusion_service.centre.births import group
 from fusion_service.centre.candidates import Candidates, Pairs, find_candidates
 from fusion_service.centre.evidence import LOW, PairEvidence, RivalLinks, Tests
-from fusion_service.centre.gating import Judgement, Settings, judge, unlink
+from fusion_service.centre.gating import Judgement, Settings, judge
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture, newborn
+from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import set_links
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import assign_near
 from schemas import Entry, messages
@@ -60,19 +62,21 @@ class Linker:
         self._places = [config.space.index(axis) for axis in ("x", "y", "z") if axis in config.space]
 
     def link(
-        self, rows: Rows, picture: Picture, now: Picture, step: int, time: int, journal: Journal
+        self, rows: Rows, picture: Picture, now: Picture, meeting: Meeting, step: int, time: int, journal: Journal
     ) -> tuple[Picture, dict[int, int]]:
-        """Decide all links of the step, writing the rows' columns. now: the picture predicted to `time`, ns.
+        """Decide all links of the step, writing the rows' columns. now: the picture predicted to `time`, ns; meeting:
+        who may meet whom in it.
 
         Returns the picture with its new tracks, and the merges: {id that ends: older id that goes on}.
         """
-        judged = judge(rows, now, time, self._settings, journal)
-        near = find_candidates(rows, now, judged, self.tests.gate, self._places, self.config.fuse_origins)
+        meeting.settle(step, journal)
+        judged = judge(rows, now, meeting.forced_row, time, self._settings, journal)
+        near = find_candidates(rows, now, meeting, judged, self.tests.gate, self._places)
         near = _without_broken(near, rows, now, judged)
-        joined = self._assign(rows, now, near, step, journal)
+        joined = self._assign(rows, now, _vacant(near, meeting), step, journal)
         merged = self._merge(rows, now, near, step, journal)
         free = near.loose[rows.tracks.link[near.loose] == NO_TRACK]
-        starting = self._shadow(rows, now, near, free)
+        starting = self._shadow(rows, now, near, meeting, free)
         picture = self._begin(rows, picture, near, judged, free, starting, step, time, journal)
         newly = np.concatenate([joined, free[rows.tracks.link[free] != NO_TRACK]])
         rows.tracks.seen[newly], rows.tracks.judged[newly] = time, rows.tracks.updated[newly]
@@ -129,7 +133,7 @@ class Linker:
         some = rows.source[near.joins.first] == name
         joins = near.joins.take(some)
         top = joins.spread.max(initial=-np.inf)
-        worth = 1.0 + 0.5 * (self.tests.gate - joins.distance) + 0.5 * (top - joins.spread)
+        worth = 1.0 + 0.5 * (rows.gate[joins.first] - joins.distance) + 0.5 * (top - joins.spread)
         mine = rows.source[near.rivals.first] == name
         rivals, sums = near.rivals.take(mine), sums[mine]
         believed = np.unique(rivals.first)
@@ -159,7 +163,7 @@ class Linker:
         tracks = rows.tracks
         if len(lost):
             journal.broke(rows, lost, tracks.link[lost], np.full(len(lost), np.nan))
-            unlink(rows, lost)
+            set_links(tracks, lost, NO_TRACK, step)
         if not len(row):
             return
         before, after = tracks.link[row], now.id[track]
@@ -167,7 +171,7 @@ class Linker:
         changed = before != NO_TRACK
         journal.decide(messages.EXCHANGED, rows, row[changed], after[changed], distance[changed], before[changed])
         journal.decide(messages.LINKED, rows, row[~changed], after[~changed], distance[~changed])
-        _set(rows, row, after, step)
+        set_links(tracks, row, after, step)
 
     def _keep_rivals(self, rows: Rows, now: Picture, near: Candidates, sums: Floats, moved: Ints) -> None:
         """The sums for the next step; those of a row that has moved are from now on beside its new link."""
@@ -189,7 +193,7 @@ class Linker:
         order = np.lexsort((track, row))
         self.rivals.keep(rows, now, row[order], track[order], value[order])
 
-    def _shadow(self, rows: Rows, now: Picture, near: Candidates, free: Ints) -> Bools:
+    def _shadow(self, rows: Rows, now: Picture, near: Candidates, meeting: Meeting, free: Ints) -> Bools:
         """Hold loose rows whose source already follows the track that they are near; (F,) which may begin one."""
         tracks, tests = rows.tracks, self.tests
         joins = near.joins.take(np.isin(near.joins.first, free))
@@ -205,7 +209,7 @@ class Linker:
         old = (tracks.shadow[free] != NO_TRACK) & (len(now.id) > 0)
         if old.any():
             old &= now.id[at] == tracks.shadow[free]
-            old &= _held(rows, now, free, at)
+            old &= _held(rows, now, free, at) & ~meeting.with_tracks(free, at).forbidden
             spread = tracks.covariance[:, :, free] + near.covariance[:, :, at]
             distance = linalg.quadratic(spread, tracks.mean[:, free] - near.mean[:, at])
             more = np.where(old, -np.nan_to_num(tests.sameness(distance), nan=-tests.bound / 2), 0.0)
@@ -226,7 +230,7 @@ class Linker:
         tracks = rows.tracks
         if not len(free):
             return picture
-        groups = group(free, rows.source, near.births, self.tests.gate)
+        groups = group(free, rows.source, near.births, rows.gate)
         count = int(groups.max(initial=-1)) + 1
         size = np.bincount(groups, minlength=count)
         may = np.bincount(groups, rows.may_start[free], minlength=count) > 0
@@ -240,9 +244,7 @@ class Linker:
         given = np.zeros(count, dtype=np.uint64)
         given[chosen] = new
         takes = given[groups] != NO_TRACK
-        first = np.full(count, -1, dtype=np.intp)
-        first[groups[::-1]] = free[::-1]
-        _set(rows, free[takes], given[groups[takes]], step)
+        set_links(tracks, free[takes], given[groups[takes]], step)
         distance = np.full(len(free), np.nan)
         journal.decide(messages.LINKED, rows, free[takes], given[groups[takes]], distance[takes])
         journal.birth(new)
@@ -251,8 +253,7 @@ class Linker:
             link = int(tracks.link[row])
             if link in born:
                 journal.split(link, old)
-        origin = rows.origin[first[chosen]]
-        return picture.join(newborn(new, len(self.config.space), time, origin))
+        return picture.join(newborn(new, len(self.config.space), time))
 
     def _merge(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> dict[int, int]:
         """Join global tracks that share no source and that the evidence says are one: {newer id: older id}."""
@@ -271,7 +272,7 @@ class Linker:
                 merged[new] = old
                 journal.merge(old, new, far[old, new])
                 moved = np.flatnonzero(rows.tracks.link == np.uint64(new))
-                _set(rows, moved, np.full(len(moved), old, dtype=np.uint64), step)
+                set_links(rows.tracks, moved, np.uint64(old), step)
         self.merges.forget(taken)
         return merged
 
@@ -284,13 +285,10 @@ class Linker:
         self.merges, self.rivals = PairEvidence.unpacked(state["merges"]), RivalLinks.unpacked(state["rivals"])
 
 
-def _set(rows: Rows, at: Ints, link: NDArray[np.uint64], step: int) -> None:
-    """Give rows a link, with nothing known of it yet."""
-    tracks = rows.tracks
-    tracks.link[at] = link
-    tracks.since[at], tracks.used[at], tracks.weighed[at] = step, -1, -1
-    tracks.evidence[at], tracks.outside[at] = 0.0, False
-    tracks.shadow[at], tracks.apart[at] = NO_TRACK, 0.0
+def _vacant(near: Candidates, meeting: Meeting) -> Candidates:
+    """Without the pairs whose place another row has by order."""
+    joins, rivals = (pairs.take(~meeting.taken(pairs.first, pairs.second)) for pairs in (near.joins, near.rivals))
+    return replace(near, joins=joins, rivals=rivals)
 
 
 def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgement) -> Candidates:

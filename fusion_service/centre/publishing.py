@@ -10,10 +10,12 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import Picture, Support, advance
 from fusion_service.config import CentreConfig
+from fusion_service.coverage import region_holds
 from fusion_service.densities import Mixtures
-from schemas import ORIGINS, GlobalTracks, Local, messages
+from schemas import ORIGINS, STATUSES, GlobalTracks, Local, messages
 
 __all__ = ["Contributions", "live_on", "picture_message"]
 
@@ -48,6 +50,7 @@ def picture_message(
     intake: Intake,
     journal: Journal,
     contributions: Contributions,
+    labels: Labels,
     *,
     epoch: int,
     seq: int,
@@ -57,13 +60,15 @@ def picture_message(
 ) -> GlobalTracks:
     """The message that publishes a picture; its lineage is every source known and the centre itself."""
     config, names = intake.config, intake.names()
+    picture, contributions = _published(picture, contributions, intake)
     origins = {source.origin for source in intake.sources.values() if source.messages}
+    origin = max(origins, key=ORIGINS.index, default="live")
     return GlobalTracks(
         source=config.name,
         epoch=epoch,
         seq=seq,
         sent=time,
-        origin=max(origins, key=ORIGINS.index, default="live"),
+        origin=origin,
         lineage=(*(name for name in names if name != config.name), config.name),
         time=time,
         step=step,
@@ -83,7 +88,28 @@ def picture_message(
         contributor_influence=contributions.influence,
         ended=journal.ended(),
         split_from=journal.splits(),
+        **labels.columns(picture.id, origin),
     )
+
+
+def _published(picture: Picture, contributions: Contributions, intake: Intake) -> tuple[Picture, Contributions]:
+    """What of the picture goes out, by its status and its place."""
+    config = intake.config
+    shown = np.isin(picture.status, [STATUSES.index(name) for name in config.publish_status])
+    if config.publish_region is not None and intake.frame is not None:
+        places = [config.space.index(axis) for axis in ("x", "y", "z") if axis in config.space]
+        shown &= region_holds(config.publish_region, picture.mean[places])
+    if shown.all():
+        return picture, contributions
+    whose = np.repeat(shown, contributions.counts)
+    kept = Contributions(
+        counts=contributions.counts[shown],
+        source=contributions.source[whose],
+        epoch=contributions.epoch[whose],
+        id=contributions.id[whose],
+        influence=contributions.influence[whose],
+    )
+    return picture.take(shown), kept
 
 
 def _densities(picture: Picture, publish: str) -> dict[str, Any]:

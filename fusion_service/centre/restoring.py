@@ -46,7 +46,6 @@ def fit_config(
         if not set(config.space) <= set(source.space):
             source.space, source.tracks = config.space, empty_tracks(len(config.space))
         source.tracks = _moved(source.tracks, source.space, frame, config.frame, config.source(name).height)
-        source.muted = source.muted or config.source(name).ignore
     picture = _moved(picture, space, frame, config.frame, config.source_defaults.height)
     for source in sources.values():
         there = np.isin(source.tracks.link, picture.id)

@@ -21,9 +21,9 @@ class Rows:
 
     source (M,): index into the sorted names. epoch (M,) u64. tracks: their columns, mean (n, M) and covariance
     (n, n, M) predicted and marginalised to the centre's space; the columns of links may be written. may_start
-    (M,). interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. origin
-    (M,): code of the source's. fresh (M,): a measurement is in it that was not judged before. kept: how many of them
-    each source has, in order.
+    (M,). interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. gate
+    (M,): d2 within which it may join or begin a track. fresh (M,): a measurement is in it that was not judged before.
+    kept: how many of them each source has, in order.
     """
 
     source: NDArray[np.intp]
@@ -32,7 +32,7 @@ class Rows:
     may_start: NDArray[np.bool_]
     interval: NDArray[np.int64]
     lost: NDArray[np.bool_]
-    origin: NDArray[np.int64]
+    gate: NDArray[np.float64]
     fresh: NDArray[np.bool_]
     kept: dict[str, int]
 

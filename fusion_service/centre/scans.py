@@ -1,16 +1,23 @@
-"""Messages of sources before they are tracks: whether their parts belong together, and intensities as scans."""
+"""Messages of sources made tracks: whether their parts belong together, intensities as scans, and the columns."""
 
 from __future__ import annotations
 
 import math
-from typing import TypeAlias
+from collections.abc import Sequence
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas import FAULTS, LocalIntensity, LocalTracks, Message, SensorInfo
+from fusion_service import geodesy, linalg
+from fusion_service.centre.sources import Tracks, no_parts, unlinked
+from fusion_service.centre.words import Lexicon
+from fusion_service.densities import Mixtures, reduce_mixtures
+from schemas import FAULTS, ORIGINS, Frame, Height, LocalIntensity, LocalTracks, Message, SensorInfo
 
-__all__ = ["MAX_PERIOD", "Scan", "as_tracks", "fits", "is_sound", "size_of"]
+__all__ = ["MAX_PERIOD", "Scan", "as_tracks", "fits", "is_sound", "message_tracks", "size_of"]
+
+Floats = NDArray[np.float64]
 
 MAX_PERIOD = 1e5
 MAX_WEIGHT = 1e3
@@ -53,12 +60,14 @@ def fits(message: Scan) -> bool:
         return message.means.shape == (total, n) and message.covariances.shape == (total, n, n)
     tracks = len(message.ids)
     total = tracks if message.counts is None else int(np.sum(message.counts))
-    lengths = (message.existence, message.updated, message.counts)
+    texts = [*(message.identity or ()), *(message.kind or ())]
+    lengths = (message.existence, message.updated, message.counts, message.identity, message.kind, message.kind_p)
     return (
         message.means.shape == (total, n)
         and message.covariances.shape == (total, n, n)
         and all(column is None or len(column) == tracks for column in lengths)
         and (message.weights is None or len(message.weights) == total)
+        and {*map(type, texts)} <= {str, type(None)}
     )
 
 
@@ -71,3 +80,83 @@ def is_sound(info: SensorInfo) -> bool:
         and all(math.isfinite(part) for part in info.position)
         and (covariance is None or bool(np.isfinite(covariance).all()))
     )
+
+
+def message_tracks(
+    messages: Sequence[LocalTracks],
+    sound: Sequence[NDArray[np.bool_]],
+    frame: Frame,
+    height: Height | None,
+    most: int,
+    said: Lexicon,
+) -> Tracks:
+    """The sound tracks of messages of one space, frame and height, in `frame`, one after the other; mixtures of
+    more than `most` components are reduced. said: gives texts their codes.
+
+    Raises `geodesy.FrameError` where their frame cannot be brought into `frame`.
+    """
+    first = messages[0]
+    means, covariances, weights, sizes = (
+        np.concatenate(column) for column in zip(*map(_components, messages, sound), strict=True)
+    )
+    means, covariances = geodesy.transform(means, covariances, first.space, first.frame, frame, first.height or height)
+    if sizes.max(initial=1) == 1:
+        mean, covariance = linalg.to_last(means, 1), linalg.symmetrise(linalg.to_last(covariances, 2))
+        parts = no_parts(len(mean), len(sizes))
+    else:
+        mixtures = Mixtures.from_rows(weights, means, covariances, sizes).normalised()
+        if len(mixtures.log_weights) > most:
+            mixtures = reduce_mixtures(mixtures, max_components=most)
+        mean, covariance = mixtures.moments()
+        parts = mixtures.log_weights, mixtures.means, linalg.symmetrise(mixtures.covariances)
+    counts = [int(rows.sum()) for rows in sound]
+    times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
+    updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
+    existence = [np.full(len(m.ids), np.nan) if m.existence is None else m.existence for m in messages]
+    return Tracks(
+        id=_gather([m.ids for m in messages], sound).astype(np.uint64),
+        time=times,
+        mean=mean,
+        covariance=linalg.symmetrise(covariance),
+        log_weight=parts[0],
+        part_mean=parts[1],
+        part_covariance=parts[2],
+        existence=_gather(existence, sound).astype(np.float64),
+        updated=np.minimum(_gather(updated, sound), times),
+        interval=np.zeros(len(times), dtype=np.int64),
+        **_told(messages, sound, counts, said),
+        **unlinked(len(times)),
+    )
+
+
+def _told(
+    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], counts: list[int], said: Lexicon
+) -> dict[str, NDArray[Any]]:
+    """The columns of what the tracks are said to be, and of their origin."""
+    nothing = [np.full(len(m.ids), -1, dtype=np.int32) for m in messages]
+    identity, kind = (
+        [none if texts is None else words.codes(texts) for texts, none in zip(column, nothing, strict=True)]
+        for words, column in ((said.identity, [m.identity for m in messages]), (said.kind, [m.kind for m in messages]))
+    )
+    sure = [np.full(len(m.ids), np.nan) if m.kind_p is None else m.kind_p for m in messages]
+    origins = np.array([ORIGINS.index(m.origin) for m in messages], dtype=np.uint8)
+    return {
+        "identity": _gather(identity, sound),
+        "kind": _gather(kind, sound),
+        "kind_p": _gather(sure, sound).astype(np.float64),
+        "origin": np.repeat(origins, counts),
+    }
+
+
+def _components(message: LocalTracks, sound: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, NDArray[np.intp]]:
+    """Means, covariances and weights of the components of the sound tracks, and how many each of these has."""
+    if message.counts is None or message.weights is None:
+        count = int(sound.sum())
+        return message.means[sound], message.covariances[sound], np.ones(count), np.ones(count, dtype=np.intp)
+    counts = message.counts.astype(np.intp)
+    rows = np.repeat(sound, counts)
+    return message.means[rows], message.covariances[rows], message.weights[rows], counts[sound]
+
+
+def _gather(columns: Sequence[NDArray[Any]], rows: Sequence[NDArray[np.bool_]]) -> NDArray[Any]:
+    return np.concatenate([column[mask] for column, mask in zip(columns, rows, strict=True)])

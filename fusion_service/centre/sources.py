@@ -15,11 +15,11 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service import geodesy, linalg
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
-from fusion_service.densities import Mixtures, reduce_mixtures
-from schemas import Frame, Height, LocalTracks, SensorInfo
+from fusion_service.centre.words import Codes
+from fusion_service.densities import Mixtures
+from schemas import LocalTracks, SensorInfo
 
 __all__ = [
     "LINKS",
@@ -30,10 +30,12 @@ __all__ = [
     "as_mixtures",
     "empty_tracks",
     "join_tracks",
-    "message_tracks",
     "newest",
     "no_parts",
     "padded",
+    "relinked",
+    "set_links",
+    "unlinked",
 ]
 
 Floats = NDArray[np.float64]
@@ -68,12 +70,13 @@ class Tracks:
     Where some track is a mixture, parts (C > 0) hold its components, log_weight (C, T) with -inf for padding,
     part_mean (n, C, T), part_covariance (n, n, C, T), and mean and covariance are their moments; else C = 0.
     id u64; time i64 of the density; updated i64 of the last measurement; existence (NaN: not reported);
-    interval i64 expected time to the next report, ns (see `intervals`);
+    interval i64 expected time to the next report, ns (see `intervals`); identity, kind i32 codes of what it is said to
+    be (-1: not said), kind_p (NaN: not said); origin u8 index into `ORIGINS` of the message;
     link u64 global id or 0; since i64 step of the link; used i64 time of the version last fused (-1: none); judged
     i64 `updated` of the newest datum that was judged, seen i64 time of the step that did; weighed i64 newest datum of
     the others in the track when evidence was last added; data i64 how many were judged in this link; evidence f64 sum
     for the link; outside: the newest datum failed its gate; shadow u64 global id that it is a second track of, or 0;
-    apart f64 sum for that.
+    apart f64 sum for that; told i64 `updated` of the version whose identity and class the global track has heard.
     """
 
     id: NDArray[np.uint64]
@@ -86,6 +89,10 @@ class Tracks:
     existence: NDArray[np.float64]
     updated: NDArray[np.int64]
     interval: NDArray[np.int64]
+    identity: Codes
+    kind: Codes
+    kind_p: NDArray[np.float64]
+    origin: NDArray[np.uint8]
     link: NDArray[np.uint64]
     since: NDArray[np.int64]
     used: NDArray[np.int64]
@@ -97,6 +104,7 @@ class Tracks:
     outside: NDArray[np.bool_]
     shadow: NDArray[np.uint64]
     apart: NDArray[np.float64]
+    told: NDArray[np.int64]
 
     def take(self, rows: Any) -> Tracks:
         """The given rows (indices or a mask)."""
@@ -107,24 +115,63 @@ class Tracks:
         return as_mixtures(self, rows)
 
 
-LINKS = ("link", "since", "used", "judged", "weighed", "seen", "data", "evidence", "outside", "shadow", "apart")
+_BLANK: dict[str, tuple[type[np.generic], float]] = {
+    "link": (np.uint64, 0),
+    **dict.fromkeys(("since", "used", "judged", "weighed", "seen"), (np.int64, -1)),
+    "data": (np.int64, 0),
+    "evidence": (np.float64, 0.0),
+    "outside": (np.bool_, False),
+    "shadow": (np.uint64, 0),
+    "apart": (np.float64, 0.0),
+    "told": (np.int64, -1),
+}
+LINKS = tuple(_BLANK)
 """Columns that a new version of a track takes over from the last."""
+OF_THE_TRACK = ("judged", "seen", "told")
+"""Those of them that a new link leaves as they are: what was done with the newest datum."""
 
 
 def empty_tracks(n: int) -> Tracks:
     """No tracks, of n components."""
-    whole, real = np.zeros(0, dtype=np.int64), np.zeros(0)
-    ids = np.zeros(0, dtype=np.uint64)
-    moments, parts = (np.zeros((n, 0)), np.zeros((n, n, 0))), no_parts(n, 0)
-    return Tracks(ids, whole, *moments, *parts, real, whole, whole, *_unlinked(0))
+    whole, real, code = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int32)
+    log_weight, part_mean, part_covariance = no_parts(n, 0)
+    return Tracks(
+        id=np.zeros(0, dtype=np.uint64),
+        time=whole,
+        mean=np.zeros((n, 0)),
+        covariance=np.zeros((n, n, 0)),
+        log_weight=log_weight,
+        part_mean=part_mean,
+        part_covariance=part_covariance,
+        existence=real,
+        updated=whole,
+        interval=whole,
+        identity=code,
+        kind=code,
+        kind_p=real,
+        origin=np.zeros(0, dtype=np.uint8),
+        **unlinked(0),
+    )
 
 
-def _unlinked(count: int) -> tuple[NDArray[Any], ...]:
+def unlinked(count: int) -> dict[str, NDArray[Any]]:
     """The columns `LINKS` of tracks that nothing is known of."""
-    never, zero = np.full(count, -1, dtype=np.int64), np.zeros(count)
-    none = np.zeros(count, dtype=np.uint64)
-    data = np.zeros(count, dtype=np.int64)
-    return none, never, never, never, never, never, data, zero, np.zeros(count, dtype=np.bool_), none, zero
+    return {name: np.full(count, blank, dtype=kind) for name, (kind, blank) in _BLANK.items()}
+
+
+def set_links(tracks: Tracks, at: NDArray[np.intp], link: NDArray[np.uint64] | np.uint64, step: int) -> None:
+    """Give the tracks `at` a link in `step`, 0 for none, with nothing known of it yet. Writes the columns `LINKS`."""
+    for name, (_, blank) in _BLANK.items():
+        if name not in OF_THE_TRACK:
+            getattr(tracks, name)[at] = blank
+    tracks.link[at], tracks.since[at] = link, step
+
+
+def relinked(tracks: Tracks, at: NDArray[np.intp], link: NDArray[np.uint64] | np.uint64, step: int) -> Tracks:
+    """The same with other links, as `set_links` gives them."""
+    new = replace(tracks, **{name: getattr(tracks, name).copy() for name in LINKS})
+    set_links(new, at, link, step)
+    return new
 
 
 def no_parts(n: int, count: int) -> tuple[Floats, Floats, Floats]:
@@ -167,69 +214,15 @@ def padded(tracks: Columns, components: int) -> Columns:
     return replace(tracks, log_weight=log_weight, part_mean=mean, part_covariance=covariance)
 
 
-def message_tracks(
-    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], frame: Frame, height: Height | None, most: int
-) -> Tracks:
-    """The sound tracks of messages of one space, frame and height, in `frame`, one after the other; mixtures of
-    more than `most` components are reduced.
-
-    Raises `geodesy.FrameError` where their frame cannot be brought into `frame`.
-    """
-    first = messages[0]
-    means, covariances, weights, sizes = (
-        np.concatenate(column) for column in zip(*map(_components, messages, sound), strict=True)
-    )
-    means, covariances = geodesy.transform(means, covariances, first.space, first.frame, frame, first.height or height)
-    if sizes.max(initial=1) == 1:
-        mean, covariance = linalg.to_last(means, 1), linalg.symmetrise(linalg.to_last(covariances, 2))
-        parts = no_parts(len(mean), len(sizes))
-    else:
-        mixtures = Mixtures.from_rows(weights, means, covariances, sizes).normalised()
-        if len(mixtures.log_weights) > most:
-            mixtures = reduce_mixtures(mixtures, max_components=most)
-        mean, covariance = mixtures.moments()
-        parts = mixtures.log_weights, mixtures.means, linalg.symmetrise(mixtures.covariances)
-    counts = [int(rows.sum()) for rows in sound]
-    times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
-    updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
-    existence = [np.full(len(m.ids), np.nan) if m.existence is None else m.existence for m in messages]
-    return Tracks(
-        id=_gather([m.ids for m in messages], sound).astype(np.uint64),
-        time=times,
-        mean=mean,
-        covariance=linalg.symmetrise(covariance),
-        log_weight=parts[0],
-        part_mean=parts[1],
-        part_covariance=parts[2],
-        existence=_gather(existence, sound).astype(np.float64),
-        updated=np.minimum(_gather(updated, sound), times),
-        interval=np.zeros(len(times), dtype=np.int64),
-        **dict(zip(LINKS, _unlinked(len(times)), strict=True)),
-    )
-
-
-def _components(message: LocalTracks, sound: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, NDArray[np.intp]]:
-    """Means, covariances and weights of the components of the sound tracks, and how many each of these has."""
-    if message.counts is None or message.weights is None:
-        count = int(sound.sum())
-        return message.means[sound], message.covariances[sound], np.ones(count), np.ones(count, dtype=np.intp)
-    counts = message.counts.astype(np.intp)
-    rows = np.repeat(sound, counts)
-    return message.means[rows], message.covariances[rows], message.weights[rows], counts[sound]
-
-
-def _gather(columns: Sequence[NDArray[Any]], rows: Sequence[NDArray[np.bool_]]) -> NDArray[Any]:
-    return np.concatenate([column[mask] for column, mask in zip(columns, rows, strict=True)])
-
-
 def newest(old: Tracks, new: Tracks) -> Tracks:
-    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept.
+    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept unless the
+    origin has changed.
 
     `old` is sorted by id; `new` may hold an id several times.
     """
     if len(old.id) and len(new.id):
         at = np.minimum(np.searchsorted(old.id, new.id), len(old.id) - 1)
-        known = old.id[at] == new.id
+        known = (old.id[at] == new.id) & (old.origin[at] == new.origin)
         kept = {name: np.where(known, getattr(old, name)[at], getattr(new, name)) for name in LINKS}
         new = replace(new, **kept)
     both = join_tracks([old, new])
@@ -243,9 +236,8 @@ class Source:
     """State of one source. Times are ns; -1 means never.
 
     interval: between its scans, ns, measured (-1: not yet). remembered: its tracks that went stale. vote: the frame it
-    speaks in. ordered: what an order last said about its being muted. why: the reason that data of it are not used, in
-    a sentence; unused: tracks that were not, by reason. Of the step being made: arrived, the ids that came; ahead, the
-    time of the newest message that is for a later one.
+    speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason. Of
+    the step being made: arrived, the ids that came; ahead, the time of the newest message that is for a later one.
     """
 
     name: str
@@ -268,7 +260,6 @@ class Source:
     interval: int = -1
     remembered: Remembered = NOTHING_REMEMBERED
     vote: Vote | None = None
-    ordered: bool | None = None
     why: str = ""
     unused: dict[str, int] = field(default_factory=dict)
     arrived: list[NDArray[np.uint64]] = field(default_factory=list)

@@ -9,12 +9,25 @@ from __future__ import annotations
 
 from types import ModuleType
 
-from fusion_service.commands import check, demo, evaluate, explain, export, hub, record, repair, replay, rules, run
+from fusion_service.commands import (
+    check,
+    demo,
+    evaluate,
+    explain,
+    export,
+    hub,
+    order,
+    record,
+    repair,
+    replay,
+    rules,
+    run,
+)
 
 __all__ = ["COMMANDS"]
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rpartition(".")[2]: module
-    for module in (hub, run, record, demo, check, rules, replay, evaluate, explain, export, repair)
+    for module in (hub, run, order, record, demo, check, rules, replay, evaluate, explain, export, repair)
 }
 """By name, in the order of the help."""

@@ -1,12 +1,13 @@
-"""Values of options as people write them: 500MB, 90s, 7d, tcp/host:port, host:port. All raise ValueError in one line;
-`fusion_service.process.argument` makes the type of an argument of one, and `positive` and `whole` stand there."""
+"""Values of options as people write them: 500MB, 90s, 7d, 2026-01-31T12:00:00Z, a port. All raise ValueError in one
+line; `fusion_service.process.argument` makes the type of an argument of one, and `positive` and `whole` stand there."""
 
 from __future__ import annotations
 
 import math
 import re
+from datetime import UTC, datetime
 
-__all__ = ["duration", "port", "size"]
+__all__ = ["duration", "moment", "port", "size"]
 
 SIZES = {"b": 1, "": 1} | {
     f"{prefix}{suffix}": base**power
@@ -26,6 +27,20 @@ def size(text: str) -> int:
 def duration(text: str) -> float:
     """Seconds: of `90s`, `15min`, `1h`, `7d`, `2w`. Raises ValueError in one line."""
     return _value(text, SECONDS, "a duration: give a number and s, min, h, d or w, as in 1h")
+
+
+def moment(text: str) -> tuple[str, float]:
+    """A duration from now, ("for", seconds), or a time in ISO 8601, ("until", ns UTC). Raises ValueError in one
+    line."""
+    try:
+        return "for", duration(text)
+    except ValueError:
+        pass
+    try:
+        when = datetime.fromisoformat(text.strip())
+    except ValueError:
+        raise ValueError(f"{text!r} is not a time: give a duration, as in 10min, or 2026-01-31T12:00:00Z") from None
+    return "until", round(when.replace(tzinfo=when.tzinfo or UTC).timestamp()) * 10**9
 
 
 def port(text: str) -> int:

@@ -24,8 +24,10 @@ from fusion_service.config.readers import (
     choice,
     endpoints,
     flag,
+    known_statuses,
     maybe,
     number,
+    origins,
     parsed,
     read_coverage,
     read_frame,
@@ -37,7 +39,7 @@ from fusion_service.config.readers import (
     whole,
 )
 from fusion_service.errors import FusionError
-from schemas import Coverage, Frame, Height, Motion, check_name, check_realm, check_space
+from schemas import ORIGINS, STATUSES, Coverage, Frame, Height, Motion, check_name, check_realm, check_space
 
 __all__ = ["BusConfig", "CentreConfig", "ConfigError", "DaemonConfig", "ServiceConfig", "SourceConfig", "config_hash"]
 
@@ -80,6 +82,9 @@ class SourceConfig:
     initiation_delay: float | None = _setting(
         None, maybe(DURATION), "seconds from entry into its coverage to a first track"
     )
+    gate: float | None = _setting(
+        None, maybe(number(0.5, 1 - 1e-12)), "probability inside the gate for a new link of its tracks; left out: gate"
+    )
     false_track: float = _setting(0.1, number(1e-6, 1), "chance that a report of a track of it is of nothing")
     covariance_floor: float = _setting(0.0, DURATION, "sigma added to its positions, m")
     registration_sigma: float = _setting(
@@ -88,6 +93,9 @@ class SourceConfig:
     inflation: float = _setting(1.0, number(0, 1e6, above=True), "factor on its covariances")
     override: bool = _setting(False, flag, "use these values even where its SensorInfo says otherwise")
     ignore: bool = _setting(False, flag, "refuse all it sends (reason: muted)")
+    allowed_origins: tuple[str, ...] = _setting(ORIGINS, origins, "origins taken from it; others are refused")
+    identity_trust: float = _setting(0.99, number(0.5, 1 - 1e-9), "probability that an identity it says is right")
+    kind_accuracy: float = _setting(0.8, number(0, 1 - 1e-9), "probability that a class it says is right")
 
 
 @dataclass(frozen=True)
@@ -110,6 +118,12 @@ class CentreConfig:
     mixture_options: dict[str, Any] = _setting({}, table, "options of the mixture rule")
     max_components: int = _setting(8, whole(1, 100), "components kept of a mixture")
     publish: str = _setting("mixture", choice("mixture", "mean", "mode"), "how a track that is a mixture goes out")
+    publish_status: tuple[str, ...] = _setting(
+        STATUSES, parsed(known_statuses, texts), "tracks of these go out: tentative, confirmed, coasting"
+    )
+    publish_region: Coverage | None = _setting(
+        None, maybe(read_coverage), "only tracks in it go out; about the origin of the picture's frame; left out: all"
+    )
     memory: str = _setting("restart", choice("restart", "recursive"), "fuse local tracks only, or the last result too")
     memory_correlation: float = _setting(
         1.0, number(0, 1), "bound on the correlation of the last result and new tracks"

@@ -13,7 +13,7 @@ from dataclasses import fields
 from typing import Any, TypeVar
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
-from schemas import Coverage, Disk, Ecef, Enu, Frame, Local, Polygon, Sector
+from schemas import ORIGINS, STATUSES, Coverage, Disk, Ecef, Enu, Frame, Local, Polygon, Sector
 from schemas.values import coverage
 
 __all__ = [
@@ -23,8 +23,10 @@ __all__ = [
     "choice",
     "endpoints",
     "flag",
+    "known_statuses",
     "maybe",
     "number",
+    "origins",
     "parsed",
     "read_coverage",
     "read_frame",
@@ -109,6 +111,14 @@ def texts(value: Any) -> tuple[str, ...]:
     return tuple(text(item) for item in value)
 
 
+def origins(value: Any) -> tuple[str, ...]:
+    """A list of origins of data."""
+    found = texts(value)
+    if not found or not set(found) <= set(ORIGINS):
+        raise ValueError(f"is {value!r}, must be a list of some of: {', '.join(ORIGINS)}")
+    return found
+
+
 def parsed(check: Callable[[Any], T], read: Callable[[Any], Any] = text) -> Callable[[Any], T]:
     """What `check` makes of what `read` gives."""
     return lambda value: check(read(value))
@@ -145,6 +155,14 @@ def build(kind: type[T], value: Any) -> T:
 def read_coverage(value: Any) -> Coverage:
     """A field of view as SensorInfo has it, or a table of its parts."""
     return value if isinstance(value, (Disk, Sector, Polygon)) else coverage(table(value))
+
+
+def known_statuses(names: tuple[str, ...]) -> tuple[str, ...]:
+    """`names` if each is a status of a global track, `ValueError` if not."""
+    unknown = [name for name in names if name not in STATUSES]
+    if unknown or not names:
+        raise ValueError(f"is {list(names)!r}, must hold some of: {', '.join(STATUSES)}")
+    return names
 
 
 def read_frame(value: Any) -> Frame | None:

@@ -18,7 +18,7 @@ from fusion_service.centre import ClockSet, MessageClock, Order, Refused, Source
 from fusion_service.config import ServiceConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.notify import notify
-from fusion_service.service.orders import read_order
+from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker
 from fusion_service.service.stepping import LastingCentre
@@ -55,7 +55,8 @@ class Service:
         self._counts = self._status.counts
         self._told = BoundedLog(config.service.log_refusals)
         self._tokens = Tokens(self._inbox.wake)
-        self._lasting = LastingCentre(config.centre, state, self._told, self._counts, self._tokens.forget)
+        self._desk = OrderDesk(lambda order: self._inbox.put("", order))
+        self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
         self._message_clock = MessageClock(config.centre) if config.centre.clock == "message" else None
         self._wall_clock = WallClock(config.centre)
         self._dropped: Counter[str] = Counter()
@@ -100,7 +101,7 @@ class Service:
         for what in ("info", "tracks", "intensity"):
             bus.subscribe(local_key("*", what, realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
-        bus.answer(global_key(name, "orders", realm), self._on_order)
+        bus.answer(global_key(name, "orders", realm), self._desk.answer)
         bus.announce(global_key(name, "alive", realm))
 
     def _wake_at(self, stop: threading.Event) -> None:
@@ -121,15 +122,12 @@ class Service:
             raise ValueError("no step has been made yet")
         return self._picture
 
-    def _on_order(self, payload: bytes | None) -> bytes:
-        self._inbox.put("", read_order(payload))
-        return b"\xc3"
-
     # The loop
 
     def _receive(self, item: Arrival | Order) -> None:
         if isinstance(item, Order):
-            log.info("order: %s %s%s", item.what, item.source, item.track or "")
+            fault = f": {item.refused}" * bool(item.refused)
+            log.info("order %d of %s: %s%s", item.number, item.who or "?", item.what, fault)
             self._lasting.handle(item, time.time_ns())
             return
         self._counts["messages"] += 1

@@ -12,8 +12,8 @@ from typing import NamedTuple
 from fusion_service.centre import Centre, ClockSet, Event, Order, StepResult, make_centre
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
-from fusion_service.service.tokens import MAX_NAMES
 from schemas import encode
 
 __all__ = ["LastingCentre", "Made"]
@@ -31,7 +31,8 @@ class Made(NamedTuple):
 class LastingCentre:
     """The centre of `config`, its ids and its checkpoint in `state`.
 
-    counts: where failed_steps and unsaved are counted. restarted: called when the centre begins anew within this
+    desk: is told what the centre knows of orders, and tells a centre made anew those it has not obeyed. counts: where
+    failed_steps and unsaved are counted. restarted: called when the centre begins anew within this
     process, and so knows nothing of what came since its checkpoint. Raises `StateError` where no generation of ids
     can be taken at the start.
     """
@@ -40,6 +41,7 @@ class LastingCentre:
         self,
         config: CentreConfig,
         state: State,
+        desk: OrderDesk,
         told: BoundedLog,
         counts: Counter[str],
         restarted: Callable[[], None],
@@ -49,10 +51,11 @@ class LastingCentre:
         self._told = told
         self._counts = counts
         self._restarted = restarted
-        self._muted: dict[str, Order] = {}
+        self._desk = desk
         self._checkpoint = state.load()
         self._generation = state.new_generation()
         self.centre = self._make_centre()
+        desk.follow(self.centre)
 
     def _make_centre(self) -> Centre:
         epoch = time.time_ns()
@@ -64,12 +67,9 @@ class LastingCentre:
         return centre
 
     def handle(self, event: Event, received: int) -> None:
-        """Queue it for the next step. What is muted stays so should the centre begin anew."""
+        """Queue it for the next step. An order is given again should the centre begin anew before that."""
         if isinstance(event, Order):
-            if event.what == "mute" and len(self._muted) < MAX_NAMES:
-                self._muted[event.source] = event
-            elif event.what == "unmute":
-                self._muted.pop(event.source, None)
+            self._desk.given(event)
         self.centre.handle(event, received)
 
     def step(self, at: int) -> Made | None:
@@ -81,6 +81,7 @@ class LastingCentre:
             if again is None:
                 return None
             made = again
+        self._desk.follow(self.centre)
         try:
             self._state.save(self._checkpoint or b"")
         except OSError as error:
@@ -121,5 +122,5 @@ class LastingCentre:
             self._told.error("cannot write an id generation: %s", error)
         self.centre = self._make_centre()
         self._restarted()
-        for order in self._muted.values():
+        for order in self._desk.again(self._checkpoint is None):
             self.centre.handle(order, time.time_ns())

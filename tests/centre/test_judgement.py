@@ -349,3 +349,44 @@ def test_live_and_exercise_are_told_apart() -> None:
             give(one, tracks("r1", second, [[0, 0, 0, 0]]), tracks("r2", second, [[0, 0, 0, 0]], origin="exercise"))
         apart, together = step(made, second), step(both, second)
     assert (len(apart.tracks.ids), len(together.tracks.ids)) == (2, 1)
+
+
+# What goes out, and gates of a source
+
+
+def test_what_is_published_can_be_chosen_by_status_and_region() -> None:
+    places = np.array([[0.0, 0, 0, 0], [5000.0, 0, 0, 0], [0.0, 9000, 0, 0]])
+    whole = FusionCentre({"lateness": 3.0})
+    part = FusionCentre(
+        {"lateness": 3.0, "publish_status": ["confirmed"], "publish_region": {"kind": "disk", "radius": 6000.0}}
+    )
+    for second in range(1, 4):
+        for made in (whole, part):
+            give(made, tracks("r1", second, places), tracks("r2", second, places[[1, 2]], [7, 8]))
+        seen, chosen = step(whole, second).tracks, step(part, second).tracks
+        wanted = (seen.status == CONFIRMED) & (np.hypot(*seen.means[:, :2].T) <= 6000.0)
+        assert chosen.ids.tolist() == seen.ids[wanted].tolist()
+        np.testing.assert_array_equal(chosen.means, seen.means[wanted])
+        assert chosen.contributor_counts.tolist() == seen.contributor_counts[wanted].tolist()
+        assert len(chosen.contributor_id) == chosen.contributor_counts.sum()
+        assert schemas.decode(schemas.encode(chosen)).ids.tolist() == chosen.ids.tolist()  # type: ignore[union-attr]
+    assert len(seen.ids) == 3
+    assert len(chosen.ids) == 2
+
+
+@pytest.mark.parametrize(("gate", "expected"), [(0.9, 2), (None, 1), (1 - 1e-9, 1)])
+def test_a_source_may_have_a_gate_of_its_own(gate: float | None, expected: int) -> None:
+    """Two states 3.4 sigma apart in one of four dimensions: d2 11.6, beyond .9 (7.8), within .999 (18.5)."""
+    said: dict[str, Any] = {"sources": {"r2": {"gate": gate}, "r1": {"gate": gate}}} if gate else {}
+    made = centre(("r1", "r2"), **said)
+    give(made, tracks("r1", 1, [[0, 0, 0, 0]]), tracks("r2", 1, [[3.4 * 30 * 2**0.5, 0, 0, 0]]))
+    assert len(step(made, 1).tracks.ids) == expected
+
+
+def test_a_track_may_need_several_sources() -> None:
+    made = centre(("r1", "r2"), min_sources=2)
+    for second in range(1, 6):
+        give(made, tracks("r1", second, [[0, 0, 0, 0]]))
+        assert step(made, second).tracks.status.tolist() == [TENTATIVE]
+    give(made, tracks("r1", 6, [[0, 0, 0, 0]]), tracks("r2", 6, [[0, 0, 0, 0]]))
+    assert step(made, 6).tracks.status.tolist() == [CONFIRMED]

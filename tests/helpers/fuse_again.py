@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import schemas
-from fusion_service.centre import FusionCentre, Order, SourceFound, SourceLost
+from fusion_service.centre import FusionCentre, SourceFound, SourceLost, order_of
 from fusion_service.config import CentreConfig
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, Message, SensorInfo, StepLog
 
@@ -39,8 +39,8 @@ def again(config: CentreConfig, messages: Iterable[Message]) -> list[tuple[Globa
         for event in log.events:
             if event["kind"] in ("found", "lost"):
                 centre.handle((SourceFound if event["kind"] == "found" else SourceLost)(event["source"]), LATER)
-            elif event["kind"] == "order":
-                centre.handle(Order(event["what"], event["source"], event["track"]), LATER)
+            elif (order := order_of(event)) is not None:
+                centre.handle(order, LATER)
         for entry in log.taken:
             centre.handle(inputs[entry.hash][0], LATER)
         made = centre.step(log.time).tracks

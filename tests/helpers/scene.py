@@ -104,6 +104,7 @@ class Scene:
         self._stack = stack
         self.bus = stack.enter_context(open_bus([hub.endpoint], wait=10.0))
         self.seen = Observer(self.bus)
+        self.running: Program | None = None
 
     def start(self, code: str, *arguments: str) -> Program:
         return self._stack.enter_context(Program(code, *arguments))

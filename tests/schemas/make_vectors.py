@@ -19,7 +19,7 @@ import msgpack
 
 SCHEMAS = Path(__file__).parents[2] / "schemas"
 VECTORS = SCHEMAS / "vectors"
-LETTERS = {"u8": "B", "u16": "H", "u64": "Q", "i64": "q", "f64": "d"}
+LETTERS = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i64": "q", "f64": "d"}
 ROW = re.compile(r"\| `(\w+)` \| ([^|]+?) \|")
 
 

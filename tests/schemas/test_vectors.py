@@ -156,3 +156,22 @@ def test_contributions_of_the_golden_picture() -> None:
     ]
     assert third["contributors"] == []
     assert [track["status"] for track in (first, second, third)] == ["tentative", "confirmed", "coasting"]
+
+
+def test_a_reader_of_before_sees_the_same_picture() -> None:
+    """What came to `global_tracks` later is left out, as a reader does that does not know it."""
+    later = ("identity", "identity_p", "kind", "kind_p", "track_origin", "marks", "number", "callsign")
+    raw = msgpack.unpackb(golden("global_tracks_identified")[0])
+    known = {key: value for key, value in raw.items() if key not in later}
+    assert len(raw) == len(known) + len(later)
+    assert msgpack.packb(known | {"seq": 41}) == golden("global_tracks")[0]
+    message = schemas.decode(msgpack.packb(known))
+    assert isinstance(message, schemas.GlobalTracks)
+    assert all(getattr(message, name) is None for name in later)
+
+
+@pytest.mark.parametrize(("field", "value"), [("track_origin", [0, 1, 4]), ("track_origin", [0, 1]), ("marks", [])])
+def test_columns_of_a_picture_that_do_not_fit_are_refused(field: str, value: list[int]) -> None:
+    raw = msgpack.unpackb(golden("global_tracks_identified")[0])
+    with pytest.raises(schemas.MessageError, match=field):
+        schemas.decode(msgpack.packb(raw | {field: bytes(value)}))

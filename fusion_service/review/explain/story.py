@@ -10,7 +10,7 @@ import math
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -107,6 +107,7 @@ class Story:
         self.supported = -1
         """Time of the last step with contributions."""
         self._open: dict[tuple[str, Member], Happening] = {}
+        self._orders: list[Any] = []
         self._before = -1
 
     def step(self, step: Step, recent: Recent) -> None:
@@ -140,10 +141,24 @@ class Story:
                 self.say(at, "the clock was set back: a new era began")
             elif kind in ("found", "lost") and source in sources:
                 self.say(at, f"{source} {'is on the bus' if kind == 'found' else 'has left the bus'}")
-            elif kind == "order" and event.get("track") == self.track:
-                self.say(at, f"order to {event.get('what')} it")
-            elif kind == "order" and source in sources:
-                self.say(at, f"order to {event.get('what')} {source}")
+            elif kind == "order" and (whom := self._concerned(event, sources)):
+                self._orders.append(event.get("number", 0))
+                self.say(at, f"order to {event.get('what')} {whom}{_ordered(event)}")
+            elif kind == "order_ended" and event.get("number") in self._orders:
+                self.say(at, f"the order to {event.get('what')} stands no more: {event.get('why')}")
+            elif kind in ("alarm", "alarm_over") and self.track in _listed(event.get("tracks")):
+                self.say(at, f"{event.get('identity')} is {'' if kind == 'alarm' else 'no longer '}in two places")
+
+    def _concerned(self, event: dict[str, Any], sources: set[str]) -> str:
+        """Whom of this story an order is about; empty where nobody of it."""
+        if self.track in (event.get("track"), event.get("other")):
+            return "it"
+        source = event.get("source")
+        if isinstance(source, str) and source in sources:
+            return source
+        members = [(name, track) for name, _, track in self.links]
+        asked = [_listed(event.get(name)) for name in ("local", "against")]
+        return " and ".join(f"{one[0]} {one[2]}" for one in asked if len(one) == 3 and (one[0], one[2]) in members)
 
     def _decisions(self, log: StepLog, at: int) -> Decided:
         """Note the decisions about the track; those about its members."""
@@ -231,6 +246,18 @@ class Story:
             sources = {member[0] for member in influence}
             held = {source: tuple(recent.get(source, ())) for source in sources}
             self.composition = Composition(picture, row, influence, values, held)
+
+
+def _listed(value: Any) -> list[Any]:
+    return list(value) if isinstance(value, (list, tuple)) else []
+
+
+def _ordered(event: dict[str, Any]) -> str:
+    """What else an order says: who gave it and why, and what came of it. Logs of before say nothing of it."""
+    who, why, outcome = (event.get(name) for name in ("who", "why", "outcome"))
+    given = f"{f' by {who}' if who else ''}{f' ({why})' if why else ''}"
+    refused = ", refused" if event.get("done") is False else ""
+    return f"{given}{refused}{f': {outcome}' if outcome else ''}"
 
 
 def _change(before: int, status: int) -> str:

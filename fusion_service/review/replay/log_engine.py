@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_service.centre import Event, NewEra, Order, SourceFound, SourceLost
+from fusion_service.centre import Event, NewEra, SourceFound, SourceLost, order_of
 from fusion_service.config import config_hash
 from fusion_service.recording.steps import PATIENCE, Step, Steps
 from fusion_service.review.replay.engine import OnStep
@@ -205,7 +205,6 @@ def _events(log: StepLog) -> list[Event]:
             events.append((SourceFound if kind == "found" else SourceLost)(source))
         elif kind == "era" and isinstance(event.get("time"), int):
             events.append(NewEra(event["time"]))
-        elif kind == "order" and isinstance(event.get("what"), str) and isinstance(source, str):
-            track = event.get("track")
-            events.append(Order(event["what"], source, track if isinstance(track, int) else None))
+        elif (order := order_of(event)) is not None:
+            events.append(order)
     return events

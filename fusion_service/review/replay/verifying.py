@@ -30,9 +30,9 @@ class Difference(NamedTuple):
 
 
 def published_as(message: GlobalTracks, name: str) -> GlobalTracks:
-    """A picture of a replay as the centre `name` publishes it: of origin replay, `name` in its lineage."""
+    """A picture of a replay as the centre `name` publishes it: all of origin replay, `name` in its lineage."""
     lineage = (*(one for one in message.lineage or () if one != message.source), name)
-    return replace(message, source=name, origin="replay", lineage=lineage)
+    return replace(message, source=name, origin="replay", lineage=lineage, track_origin=None)
 
 
 def differences(
@@ -92,6 +92,7 @@ class Verdict:
         return f"{text}; {differing} of {self.compared} compared steps differ{far}"
 
 
+_LABELS = ("identity", "identity_p", "kind", "kind_p", "track_origin", "marks", "number", "callsign")
 _HEADER = ("time", "rule", "space", "frame", "source", "epoch", "seq", "step", "origin", "lineage", "sources")
 
 
@@ -142,6 +143,9 @@ class _Parts:
                 for j in range(i + 1):
                     yield f"covariance {one}, {space[j]}{part}", float(picture.covariances[place, i, j])
         yield "updated", int(picture.updated[row])
+        for name in _LABELS:
+            if (column := getattr(picture, name)) is not None:
+                yield name.replace("_", " "), column[row] if isinstance(column, tuple) else column[row].item()
         some = slice(self.contributions[row], self.contributions[row + 1])
         who = [
             (picture.sources[source], epoch, track)

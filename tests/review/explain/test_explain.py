@@ -135,7 +135,7 @@ def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
         return {6: spread(20_000)} if name == "r2" else {7: spread(40_000)}
 
     places(flight, range(1, 8), seen_by)
-    flight.centre.handle(Order("mute", "r2"), START)
+    flight.centre.handle(Order("mute", "r2", who="anna", why="noise"), START)
     places(flight, range(8, 12), seen_by)
     flight.centre.handle(Order("delete", track=int(flight.steps[-1].tracks.ids[-1])), START)
     places(flight, range(12, 14), lambda name, second: seen_by(name, second) if name != "r3" else {})
@@ -151,11 +151,13 @@ def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
     text = told(path, "2")
     assert line(text, "r2 6 leaves: the source was muted by order").startswith("7.0")
     assert line(text, "order to mute r2").startswith("7.0")
+    assert "order to mute r2 by anna (noise): refuses what r2 sends" in text
     refused = line(text, "refused (muted)")
     assert re.search(r"r2: \d+ messages refused \(muted\)", refused)
 
     text = told(path, "3")
     assert "deleted by an operator's order" in line(text, "ended")
+    assert "order to delete it: ends track" in text
     table = listing(read_mission(path))
     rows = {one.split()[0]: one for one in table.splitlines()[2:-1]}
     assert rows["1"].split()[1:4] == ["0.0", "7.0", "7.0"]

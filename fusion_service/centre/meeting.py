@@ -1,0 +1,102 @@
+"""`Meeting`: who may meet whom in one step, and what identity says for it: all that association asks, in one place.
+
+It puts together operators' orders (`constraints`), origin and quarantine (`compartments`), and identities.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.centre.constraints import constraints
+from fusion_service.centre.identity import TRUSTED, Terms
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.labels import Labels
+from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import set_links
+from fusion_service.centre.words import NONE
+from schemas import messages
+
+__all__ = ["Meeting"]
+
+Ints = NDArray[np.intp]
+Ids = NDArray[np.uint64]
+Mask = NDArray[np.bool_]
+
+
+class Meeting:
+    """For the rows and the global tracks (ids, sorted) of one step; names: all sources, sorted.
+
+    held (M,): rows that neither start nor join a track. forced_row, forced_track (L,): pairs to be linked, gate or
+    no gate. compartment_of_rows (M,), compartment_of_tracks (G,): those of different ones are no pair. Links are
+    those that the rows have when this is made.
+    """
+
+    def __init__(self, intake: Intake, labels: Labels, rows: Rows, ids: Ids, names: tuple[str, ...]) -> None:
+        self._rows, self._ids, self._identities = rows, ids, labels.identities
+        self._orders = constraints(intake.orders, rows, names)
+        self.compartment_of_rows = labels.compartments.of_rows(rows, names)
+        self.compartment_of_tracks = labels.compartments.of_tracks(ids, rows, names)
+        self.held = self._orders.held
+        there = np.isin(self._orders.forced_track, ids)
+        self.forced_row, self.forced_track = self._orders.forced_row[there], self._orders.forced_track[there]
+
+    def settle(self, step: int, journal: Journal) -> None:
+        """Make at once the links that are ordered, and break those that must not be."""
+        tracks = self._rows.tracks
+        bad = self._unwanted()
+        journal.broke(self._rows, bad, tracks.link[bad], np.full(len(bad), np.nan))
+        set_links(tracks, bad, NO_TRACK, step)
+        other = tracks.link[self.forced_row] != self.forced_track
+        row, track = self.forced_row[other], self.forced_track[other]
+        journal.decide(messages.LINKED, self._rows, row, track, np.full(len(row), np.nan))
+        set_links(tracks, row, track, step)
+
+    def _unwanted(self) -> Ints:
+        """The rows whose standing links an order forbids, or another row of the track that is trusted to be another
+        object. Of two rows that are never to be together the second leaves, unless it is linked by order."""
+        linked, link, orders = self._rows.linked(), self._rows.tracks.link, self._orders
+        together = (link[orders.apart_i] == link[orders.apart_j]) & (link[orders.apart_i] != NO_TRACK)
+        i, j = orders.apart_i[together], orders.apart_j[together]
+        leaves = np.where(np.isin(j, self.forced_row), i, j)
+        stays = np.setdiff1d(np.concatenate([i, j]), leaves)
+        bad = orders.forbids(linked, link[linked]) & ~np.isin(linked, stays)
+        odd = self._identities.contradicted(self._rows, linked, self.forced_row)
+        bad |= np.isin(linked, odd)
+        return linked[bad & ~np.isin(linked, self.forced_row)]
+
+    def with_tracks(self, row: Ints, at: Ints) -> Terms:
+        """Of P pairs of a row and a global track (its place in `ids`): the log-likelihood ratio, by what they are said
+        to be, of one object to two, and which are forbidden."""
+        terms = self._identities.terms(self._rows, row, self._ids[at])
+        forbidden = terms.forbidden | self._identities.denied(self._rows, row, self._ids[at])
+        forbidden |= self.compartment_of_rows[row] != self.compartment_of_tracks[at]
+        return Terms(terms.ratio, forbidden | self._orders.forbids(row, self._ids[at]))
+
+    def with_rows(self, i: Ints, j: Ints) -> Terms:
+        """The same of P pairs of rows."""
+        terms = self._identities.row_terms(self._rows, i, j)
+        forbidden = terms.forbidden | (self.compartment_of_rows[i] != self.compartment_of_rows[j])
+        return Terms(terms.ratio, forbidden | self._orders.parts(i, j))
+
+    def of_tracks(self, a: Ints, b: Ints) -> Mask:
+        """Of P pairs of global tracks (places in `ids`), those never to be merged."""
+        forbidden: Mask = self.compartment_of_tracks[a] != self.compartment_of_tracks[b]
+        code, p = self._identities.named(self._ids)
+        both = (code[a] != NONE) & (code[b] != NONE) & (p[a] >= TRUSTED) & (p[b] >= TRUSTED)
+        if both.any():
+            schemes = self._identities.schemes()
+            forbidden |= both & (schemes[code[a]] == schemes[code[b]]) & (code[a] != code[b])
+        if len(self._orders.separate):
+            low, high = np.minimum(self._ids[a], self._ids[b]), np.maximum(self._ids[a], self._ids[b])
+            for first, second in self._orders.separate.tolist():
+                forbidden |= (low == np.uint64(first)) & (high == np.uint64(second))
+        return forbidden
+
+    def taken(self, row: Ints, at: Ints) -> Mask:
+        """Of P pairs of a row and a global track (its place in `ids`), those whose place another row of the source has
+        by order."""
+        source, width = self._rows.source, max(len(self._ids), 1)
+        keys = source[self.forced_row] * width + np.searchsorted(self._ids, self.forced_track)
+        return np.isin(source[row] * width + at, keys) & ~np.isin(row, self.forced_row)

@@ -1,0 +1,154 @@
+"""`OrderDesk`: where operators' orders come in, and what they are answered at once.
+
+An order is obeyed in the centre's next step. It is judged here against the picture after the last one, so that who
+ordered hears now what it will do, or why not, and under which number; what it did in fact stands under that number in
+the step log. Requests are MessagePack maps:
+
+none, or {"what": "list"}           -> {"orders": [...], "time": ns}: the orders that stand
+{"what": WORD, ...}                 -> {"number": n, "done": bool, "outcome": text, "track": id or nil}
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any, NamedTuple, cast
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.centre import NEEDED, WHAT, Centre, Order, View, judge, read_order
+from schemas import check_name
+
+__all__ = ["OrderDesk"]
+
+COUNTERS = 2**32
+MOST_BYTES = 64_000
+MOST_FOR = 1e9
+
+
+class Held(NamedTuple):
+    """A source's columns that orders are judged by, as they were after a step."""
+
+    epoch: int
+    tracks: Any
+
+
+class OrderDesk:
+    """Answers orders on threads of the bus and hands them on; put: takes an order for the centre's next step."""
+
+    def __init__(self, put: Callable[[Order], None]) -> None:
+        self._put = put
+        self._lock = threading.Lock()
+        self._view = View(-1, np.zeros(0, dtype=np.uint64), {}, {})
+        self._listed: list[dict[str, Any]] = []
+        self._next = 1
+        self._given: list[Order] = []
+
+    def follow(self, centre: Centre) -> None:
+        """After a step, or with a new centre: what orders are judged by from now on."""
+        live, orders = centre.view(), centre.orders
+        sources = {name: Held(source.epoch, source.tracks) for name, source in live.sources.items()}
+        view = replace(live, sources=sources, standing=dict(live.standing))
+        with self._lock:
+            self._view, self._listed = view, orders.listed()
+            self._next = max(self._next, orders.next)
+            self._given.clear()
+
+    def given(self, order: Order) -> None:
+        """The centre has this order for its next step."""
+        with self._lock:
+            self._given.append(order)
+
+    def again(self, whole: bool) -> list[Order]:
+        """What a centre made anew is to be told: the orders of the step that failed; whole: it begins with nothing,
+        and is told what was ordered about sources alone, lest another order be what fails."""
+        with self._lock:
+            stood = [one.order for _, one in sorted(self._view.standing.items())] if whole else []
+            given, self._given = self._given, []
+        return [one for one in stood + given if not whole or one.what in ("mute", "unmute", "quarantine", "release")]
+
+    def answer(self, payload: bytes | None) -> bytes:
+        """The answer to a request. `ValueError` in one line where it is none."""
+        raw = _map(payload)
+        if raw.get("what", "list") == "list":
+            with self._lock:
+                return cast(bytes, msgpack.packb({"orders": self._listed, "time": max(self._view.time, 0)}))
+        with self._lock:
+            view = self._view
+            order = self._read(dict(raw), view)
+            if not order.refused:
+                outcome = judge(order, view)
+                order = order if outcome.done else replace(order, refused=outcome.text)
+            else:
+                outcome = judge(order, view)
+            order = replace(order, number=self._next)
+            self._next += 1
+        self._put(order)
+        answer = {"number": order.number, "done": outcome.done, "outcome": outcome.text, "track": order.track}
+        return cast(bytes, msgpack.packb(answer))
+
+    def _read(self, raw: dict[str, Any], view: View) -> Order:
+        """The order of a request: tracks by any of their names, `for` seconds from the last step."""
+        if raw["what"] not in WHAT:
+            raise ValueError(f'an order is a map: {{"what": {" | ".join(WHAT)}, ...}}')
+        for name in NEEDED.get(raw["what"], ()):
+            if raw.get(name) is None:
+                raise ValueError(f"the order {raw['what']} needs: {', '.join(NEEDED[raw['what']])}")
+        if "source" in NEEDED.get(raw["what"], ()):
+            check_name(raw["source"] if isinstance(raw["source"], str) else str([raw["source"]]))
+        refused = ""
+        for name in ("track", "other"):
+            if raw.get(name) is not None:
+                if type(raw[name]) is not str and not (type(raw[name]) is int and raw[name] >= 0):
+                    raise ValueError(f"the order's {name}: must be a global id, or a name of one")
+                try:
+                    raw[name] = find_track(raw[name], view)
+                except LookupError as error:
+                    raw[name], refused = None, refused or str(error)
+        if raw["what"] == "withdraw":
+            raw["withdrawn"] = raw.get("number", raw.get("withdrawn"))
+        seconds = raw.pop("for", None)
+        if seconds is not None:
+            if not (isinstance(seconds, (int, float)) and 0 < seconds <= MOST_FOR):
+                raise ValueError("the order's for: must be seconds above 0")
+            raw["until"] = max(view.time, 0) + round(seconds * 1e9)
+        return read_order({**raw, "number": None, "refused": refused or None})
+
+
+def find_track(name: Any, view: View) -> int:
+    """The global id that a whole id, a number or callsign given by an order, or the short number of a recording (7,
+    2.7) names. `LookupError` in one line where it is none, or several."""
+    text = str(name).strip()
+    for one in view.standing.values() if text else ():
+        if one.order.what == "rename" and text in (one.order.name, str(one.order.shown or "")) and one.order.track:
+            return one.order.track
+    match = re.fullmatch(r"(?:(\d{1,10})\.)?(\d{1,20})", text, flags=re.ASCII)
+    ids: NDArray[np.uint64] = view.ids
+    found = ids[:0]
+    if match and int(match[2]) < 2**64:
+        number = int(match[2])
+        found = ids[ids == np.uint64(number)] if not match[1] else found
+        if not len(found) and number < COUNTERS:
+            found = ids[ids % np.uint64(COUNTERS) == np.uint64(number)]
+    if len(found) == 1:
+        return int(found[0])
+    known = ", ".join(str(one) for one in (found if len(found) else ids)[:8].tolist()) or "none"
+    if len(found):
+        raise LookupError(f"{text} is several tracks: {known}: give the whole id")
+    raise LookupError(f"there is no track {text}: known are {known}" + (" ..." if len(ids) > 8 else ""))
+
+
+def _map(payload: bytes | None) -> Mapping[str, Any]:
+    if not payload:
+        return {}
+    try:
+        raw = msgpack.unpackb(payload) if len(payload) <= MOST_BYTES else None
+    except (ValueError, TypeError, RecursionError) as error:
+        raise ValueError(f"an order is a MessagePack map: {error}") from None
+    if not isinstance(raw, dict):
+        raise ValueError('an order is a MessagePack map, as in {"what": "mute", "source": "radar-1"}')
+    return raw
