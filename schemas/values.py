@@ -22,6 +22,7 @@ from schemas.spaces import Coverage, Disk, Ecef, Enu, Frame, Height, Local, Moti
 __all__ = [
     "Convert",
     "check_symmetric",
+    "coverage",
     "free_map",
     "pack_column",
     "pack_covariances",

@@ -377,7 +377,7 @@ def test_what_is_published_can_be_chosen_by_status_and_region() -> None:
 @pytest.mark.parametrize(("gate", "expected"), [(0.9, 2), (None, 1), (1 - 1e-9, 1)])
 def test_a_source_may_have_a_gate_of_its_own(gate: float | None, expected: int) -> None:
     """Two states 3.4 sigma apart in one of four dimensions: d2 11.6, beyond .9 (7.8), within .999 (18.5)."""
-    said: dict[str, Any] = {"sources": {"r2": {"gate": gate}, "r1": {"gate": gate}}} if gate else {}
+    said: dict[str, Any] = {"source_defaults": {"gate": gate}} if gate else {}
     made = centre(("r1", "r2"), **said)
     give(made, tracks("r1", 1, [[0, 0, 0, 0]]), tracks("r2", 1, [[3.4 * 30 * 2**0.5, 0, 0, 0]]))
     assert len(step(made, 1).tracks.ids) == expected
