@@ -84,13 +84,15 @@ class Tests:
 
 @dataclass(slots=True)
 class PairEvidence:
-    """Sums about pairs of global ids, for a merge: {(older, newer): (sum, newest datum of each when it was added)}."""
+    """Sums about pairs of global ids, for a merge: {(older, newer): (sum, newest datum of each when it was added)}.
+    parted: those of them of which one was split from the other."""
 
     pairs: dict[tuple[int, int], tuple[float, int, int]] = field(default_factory=dict)
+    parted: set[tuple[int, int]] = field(default_factory=set)
 
     def add(self, first: Ints, second: Ints, amount: Floats, picture: Picture, bound: float) -> None:
         """Add to the pairs of rows of the picture that are near now, where both have new data since the last time;
-        every other pair is forgotten."""
+        every other pair is forgotten, but for those that were parted."""
         kept: dict[tuple[int, int], tuple[float, int, int]] = {}
         ids, seen = picture.id, picture.seen
         columns = (ids[first], ids[second], amount, seen[first], seen[second])
@@ -100,7 +102,14 @@ class PairEvidence:
                 total = min(max(total + more, -bound), bound)
                 old_a, old_b = new_a, new_b
             kept[a, b] = (total, old_a, old_b)
-        self.pairs = kept
+        there = set(ids.tolist()) if any(pair not in kept for pair in self.parted) else set()
+        self.parted = {pair for pair in self.parted if pair in kept or there.issuperset(pair)}
+        self.pairs = kept | {pair: self.pairs[pair] for pair in sorted(self.parted - kept.keys()) if pair in self.pairs}
+
+    def part(self, old: int, new: int, bound: float) -> None:
+        """`new` was split from `old`: to merge them again takes the way from the other end."""
+        self.parted.add((old, new))
+        self.pairs[old, new] = (-bound, -1, -1)
 
     def ripe(self, bound: float) -> list[tuple[int, int]]:
         """Pairs decided for a merge, most certain and then oldest first."""
@@ -110,15 +119,21 @@ class PairEvidence:
     def forget(self, tracks: set[int]) -> None:
         """Drop the pairs of these global ids."""
         self.pairs = {pair: kept for pair, kept in self.pairs.items() if not tracks & set(pair)}
+        self.parted = {pair for pair in self.parted if not tracks & set(pair)}
 
     def packed(self) -> list[Any]:
         """As plain values, in order."""
-        return [[*pair, *kept] for pair, kept in sorted(self.pairs.items())]
+        return [[*pair, *kept, pair in self.parted] for pair, kept in sorted(self.pairs.items())]
 
     @classmethod
     def unpacked(cls, packed: list[Any]) -> PairEvidence:
         """From what `packed` gave."""
-        return cls({(int(a), int(b)): (float(s), int(u), int(v)) for a, b, s, u, v in packed})
+        made = cls()
+        for a, b, total, first, second, parted in packed:
+            made.pairs[int(a), int(b)] = (float(total), int(first), int(second))
+            if parted:
+                made.parted.add((int(a), int(b)))
+        return made
 
 
 @dataclass(slots=True)

@@ -253,6 +253,7 @@ class Linker:
             link = int(tracks.link[row])
             if link in born:
                 journal.split(link, old)
+                self.merges.part(old, link, self.tests.bound)
         return picture.join(newborn(new, len(self.config.space), time))
 
     def _merge(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> dict[int, int]:

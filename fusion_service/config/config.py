@@ -131,7 +131,7 @@ class CentreConfig:
     motion: Motion = _setting(Motion("cv", 1.0), lambda v: build(Motion, v), "motion of a global track on its own")
     gate: float = _setting(0.999, number(0.5, 1 - 1e-9), "probability inside the gate for a new link")
     keep_gate: float = _setting(0.9999, number(0.5, 1 - 1e-12), "probability inside the gate for a standing link")
-    merge_gate: float = _setting(0.99, number(0.5, 1 - 1e-9), "two global tracks further apart are not the same")
+    merge_gate: float = _setting(0.999, number(0.5, 1 - 1e-9), "two global tracks further apart are not the same")
     error_rate: float = _setting(
         1e-3, number(1e-9, 0.2), "rate of wrong decisions about links, exchanges, merges and splits"
     )
