@@ -220,16 +220,19 @@ def command_of(words: list[str]) -> tuple[str, list[str]]:
 
 
 def check_module(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """`python -m` of ours."""
+    """`python -m` of ours: a module, or a package whose parser may be in any of its files."""
     assert name.startswith(("benchmarks.", "tests.schemas.", "fusion_service.rules")), name
     found = importlib.util.find_spec(name)
     assert found is not None, name
     assert found.origin is not None, name
-    if "argparse" not in Path(found.origin).read_text("utf-8"):
+    package = found.submodule_search_locations is not None
+    files = sorted(Path(found.origin).parent.glob("*.py")) if package else [Path(found.origin)]
+    if not any("argparse" in file.read_text("utf-8") for file in files):
         assert arguments == [], name
         return
     monkeypatch.setattr(sys, "argv", [name, *arguments])
-    monkeypatch.delitem(sys.modules, name, raising=False)  # runpy warns of what another test imported
+    started = f"{name}.__main__" if package else name
+    monkeypatch.delitem(sys.modules, started, raising=False)  # runpy warns of what another test imported
     with pytest.raises(Parsed):
         runpy.run_module(name, run_name="__main__")
 
@@ -269,7 +272,7 @@ def test_shell_lines_are_read(block: Block, words: list[str], monkeypatch: pytes
 
 
 TOPICS = {
-    f"fusion-service {name}" for name in ("evaluate", "replay", "explain", "export", "repair", "record", "run")
+    f"fusion-service {name}" for name in ("evaluate", "replay", "explain", "export", "repair", "record", "run", "order")
 } | {"sensor-client simulate", "sensor-client playback"}
 """In the text, a command may be named without what it must be given."""
 

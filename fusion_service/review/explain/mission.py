@@ -65,12 +65,12 @@ class RecordedMission:
         """Since the start."""
         return (at - self.start) / 1e9
 
-    def gates(self) -> tuple[float, float]:
-        """Bounds on d2 of a new and of a standing link; NaN where the settings are not known."""
+    def gates(self) -> tuple[float, float, float]:
+        """Bounds on d2 of a new link, of a standing one and of a merge; NaN where the settings are not known."""
         if self.config is None or self.config.kind == "intensity":
-            return math.nan, math.nan
-        n = len(self.config.space)
-        return chi2_quantile(self.config.gate, n), chi2_quantile(self.config.keep_gate, n)
+            return math.nan, math.nan, math.nan
+        n, config = len(self.config.space), self.config
+        return chi2_quantile(config.gate, n), chi2_quantile(config.keep_gate, n), chi2_quantile(config.merge_gate, n)
 
 
 def read_mission(

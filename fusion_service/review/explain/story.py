@@ -18,9 +18,23 @@ from fusion_service.recording import RawMessage
 from fusion_service.recording.steps import Step
 from fusion_service.review.explain.histories import GONE
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks, MessageError, StepLog, decode
-from schemas.messages import BORN, BROKEN, COASTING, DELETED, GATE_FAILED, KEPT, LINKED, MERGED, SPLIT, TENTATIVE
+from schemas.messages import (
+    BORN,
+    BROKEN,
+    COASTING,
+    DELETED,
+    EXCHANGED,
+    GATE_FAILED,
+    KEPT,
+    LINKED,
+    MERGED,
+    SPLIT,
+    TENTATIVE,
+)
 
 __all__ = [
+    "CAME",
+    "WENT",
     "Composition",
     "Happening",
     "Link",
@@ -37,6 +51,8 @@ Decided = dict[Member, tuple[str, float]]
 """What was decided of each member in a step: the word, and d2."""
 
 WORDS = {LINKED: "linked", KEPT: "kept", GATE_FAILED: "outside its gate", BROKEN: "broken off"}
+CAME, WENT = "comes over by exchange from", "goes over by exchange to"
+SILENT = "the source has said nothing new"
 MOST_HAPPENINGS = 10_000
 
 
@@ -58,7 +74,8 @@ class Happening:
 @dataclass(slots=True)
 class Link:
     """What a member brought from its first to its last step: in so many steps, influence in total, least and most;
-    there: whether it is a part in the newest step; value: its newest d2."""
+    there: whether it is a part in the newest step; aside: linked, but left out since it failed its gate; value: its
+    newest d2."""
 
     first: int
     last: int
@@ -67,11 +84,12 @@ class Link:
     least: float = math.inf
     most: float = -math.inf
     there: bool = True
+    aside: bool = False
     value: float = math.nan
 
     def bring(self, at: int, influence: float) -> None:
         """Its part in the step at `at`."""
-        self.last, self.steps, self.there = at, self.steps + 1, True
+        self.last, self.steps, self.there, self.aside = at, self.steps + 1, True, False
         if math.isfinite(influence):
             self.total += influence
             self.least, self.most = min(self.least, influence), max(self.most, influence)
@@ -102,6 +120,8 @@ class Story:
         self.first = self.last = -1
         self.steps = 0
         self.ended: tuple[int, str, int | None] | None = None
+        self.ordered: set[int] = set()
+        """MERGED, SPLIT: how it ended, or began, by an operator's order."""
         self.composition: Composition | None = None
         self.newest: tuple[GlobalTracks, int] | None = None
         self.supported = -1
@@ -167,22 +187,26 @@ class Story:
         told = set()
         for row in np.flatnonzero((one.track == track) | (one.other == track)).tolist():
             kind, value, other = int(one.kind[row]), float(one.value[row]), int(one.other[row])
-            mine, source = one.track[row] == track, int(one.source[row])
-            if mine and kind in WORDS and source < len(log.sources):
-                member = log.sources[source], int(one.epoch[row]), int(one.id[row])
+            mine, source = bool(one.track[row] == track), int(one.source[row])
+            member = log.sources[source] if source < len(log.sources) else "", int(one.epoch[row]), int(one.id[row])
+            if kind == EXCHANGED and member[0]:
+                decided[member] = (CAME if mine else WENT), value
+                self.say(at, CAME if mine else WENT, member, other if mine else int(one.track[row]), value)
+            elif mine and kind in WORDS and member[0]:
                 decided[member] = WORDS[kind], value
                 told.add((WORDS[kind], member))
                 self._repeat(at, WORDS[kind], member, value)
             elif kind == BORN:
                 self.say(at, "born")
             elif kind == SPLIT:
-                self.say(
-                    at, "split from" if mine else "split off it:", None, other if mine else int(one.track[row]), value
-                )
+                whom = other if mine else int(one.track[row])
+                self.say(at, "split from" if mine else "split off it:", None, whom, value)
+                self.ordered |= {SPLIT} if mine and _split_by_order(log, self.track) else set()
             elif kind == DELETED:
                 self.ended = at, "lost", None
             elif kind == MERGED:
                 self.ended = (at, "merged", other) if mine else self.ended
+                self.ordered |= {MERGED} if mine and _merged_by_order(log, self.track) else set()
                 self.say(at, "merged into" if mine else "took in", None, other if mine else int(one.track[row]), value)
         for key in [key for key in self._open if key not in told]:
             del self._open[key]
@@ -228,17 +252,29 @@ class Story:
             link.bring(at, part)
             link.value = decided[member][1] if member in decided else math.nan
         for member, link in self.links.items():
-            if link.there and member not in influence:
-                link.there = False
-                if decided.get(member, ("",))[0] != "broken off":
-                    after = _elsewhere(member, log, self.track)
-                    why = "goes over to" if after is not None else f"leaves: {_why(member, at, log, recent)}"
-                    self.say(at, why, member, after)
+            if (link.there or link.aside) and member not in influence:
+                self._left(member, link, at, log, decided.get(member, ("", 0.0))[0], recent)
         if status != self._before:
             before, self._before = self._before, status
             if before >= 0 or status != TENTATIVE:
                 self.say(at, _change(before, status))
         self.newest = picture, row
+        self._compose(picture, row, influence, recent)
+
+    def _left(self, member: Member, link: Link, at: int, log: StepLog | None, word: str, recent: Recent) -> None:
+        """The member is no part of this step; word: what was decided of it."""
+        after, was_aside = _elsewhere(member, log, self.track), link.aside
+        link.there, link.aside = False, word == WORDS[GATE_FAILED]
+        if link.aside or word in (WORDS[BROKEN], WENT):
+            return
+        why = _why(member, at, log, recent) if after is None else ""
+        if was_aside and why.startswith(SILENT):
+            link.aside = True
+            return
+        self.say(at, "goes over to" if after is not None else f"leaves: {why}", member, after)
+
+    def _compose(self, picture: GlobalTracks, row: int, influence: dict[Member, float], recent: Recent) -> None:
+        at = picture.time
         if influence:
             self.supported = at
         if (influence or self.until is not None) and (self.until is None or at <= self.until):
@@ -258,6 +294,25 @@ def _ordered(event: dict[str, Any]) -> str:
     given = f"{f' by {who}' if who else ''}{f' ({why})' if why else ''}"
     refused = ", refused" if event.get("done") is False else ""
     return f"{given}{refused}{f': {outcome}' if outcome else ''}"
+
+
+def _obeyed(log: StepLog, what: str) -> list[dict[str, Any]]:
+    """The orders of this kind that the step obeyed."""
+    found = [event for event in log.events if event.get("kind") == "order" and event.get("what") == what]
+    return [event for event in found if event.get("done") is not False]
+
+
+def _merged_by_order(log: StepLog, track: int) -> bool:
+    return any(event.get("other") == track for event in _obeyed(log, "merge"))
+
+
+def _split_by_order(log: StepLog, track: int) -> bool:
+    """Whether a local track that the step counts to the new global one was ordered to leave another."""
+    one = log.decisions
+    mine = np.flatnonzero((one.track == np.uint64(track)) & (one.source < len(log.sources)))
+    members = {(log.sources[s], i) for s, i in zip(one.source[mine].tolist(), one.id[mine].tolist(), strict=True)}
+    locals_ = (_listed(event.get("local")) for event in _obeyed(log, "split"))
+    return any(len(local) == 3 and (local[0], local[2]) in members for local in locals_)
 
 
 def _change(before: int, status: int) -> str:
@@ -298,7 +353,7 @@ def _elsewhere(member: Member, log: StepLog | None, track: int) -> int | None:
     if log is None:
         return None
     one, (source, epoch, local) = log.decisions, member
-    linked = np.isin(one.kind, (LINKED, KEPT, GATE_FAILED)) & (one.track != np.uint64(track))
+    linked = np.isin(one.kind, (LINKED, KEPT, GATE_FAILED, EXCHANGED)) & (one.track != np.uint64(track))
     for row in np.flatnonzero(linked & (one.id == np.uint64(local)) & (one.epoch == np.uint64(epoch))).tolist():
         if int(one.source[row]) < len(log.sources) and log.sources[int(one.source[row])] == source:
             return int(one.track[row])
@@ -322,4 +377,4 @@ def _why(member: Member, at: int, log: StepLog | None, recent: Recent) -> str:
         return f"the source lists it no more (its scan is {age:.1f} s old)"
     if isinstance(newest, LocalIntensity):
         return f"the source expects too little there (its intensity is {age:.1f} s old)"
-    return f"the source has said nothing new of it for {age:.1f} s"
+    return f"{SILENT} of it for {age:.1f} s"

@@ -12,9 +12,9 @@ from fusion_service.errors import ReviewError
 from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.explain.histories import GONE, TrackHistory
 from fusion_service.review.explain.mission import RecordedMission, Refusals
-from fusion_service.review.explain.story import Composition, Happening, Link, Member, Story, local_messages
+from fusion_service.review.explain.story import CAME, WENT, Composition, Happening, Link, Member, Story, local_messages
 from schemas import STATUSES, LocalTracks
-from schemas.messages import COASTING, TENTATIVE
+from schemas.messages import COASTING, MERGED, SPLIT, TENTATIVE
 
 __all__ = ["explanation", "listing"]
 
@@ -77,7 +77,7 @@ class _Teller:
     def __init__(self, mission: RecordedMission, story: Story) -> None:
         self.mission, self.story = mission, story
         self.label = mission.labels
-        self.new_gate, self.gate = mission.gates()
+        self.new_gate, self.gate, self.merge_gate = mission.gates()
         sources = [source for source, _, _ in story.links]
         runs = {(source, epoch) for source, epoch, _ in story.links}
         self._epochs = {source: sorted(epoch for one, epoch in runs if one == source) for source in set(sources)}
@@ -143,6 +143,7 @@ class _Teller:
             return ", alone" if one.what == "kept" else ""
         span = "-".join(dict.fromkeys((f"{one.low:.1f}", f"{one.high:.1f}")))
         gate = self.gate if one.what.startswith(("kept", "outside", "broken")) else self.new_gate
+        gate = self.merge_gate if one.what in ("merged into", "took in") else gate
         return f", d2 {span}" + (f" of gate {gate:.1f}" if math.isfinite(gate) else "")
 
     def _refusals(self) -> list[Refusals]:
@@ -194,7 +195,8 @@ class _Teller:
         text = f"Track {name} was born at {self.time(born.first)} s from {self.names(founders)}"
         parent = split.other if split is not None else life.parent
         if parent is not None:
-            text += f", split from track {self.label(parent)} with which it no longer agreed"
+            why = "by an operator's order" if SPLIT in story.ordered else "with which it no longer agreed"
+            text += f", split from track {self.label(parent)} {why}"
         confirmed = next((one for one in story.happenings if one.what == "confirmed"), None)
         if confirmed is None:
             return [f"{text}; it was never confirmed."]
@@ -211,7 +213,12 @@ class _Teller:
         for one in story.happenings:
             at = self.time(one.first)
             if one.what == "broken off" and one.member is not None:
-                said.append(f"{self.name(one.member)} was broken off at {at} s: too far from the others.")
+                why = "too far from the others" if math.isfinite(one.low) else "another has its place"
+                said.append(f"{self.name(one.member)} was broken off at {at} s: {why}.")
+            elif one.what in (CAME, WENT) and one.member is not None and one.other is not None:
+                how, where = ("came over from", "here") if one.what == CAME else ("went over to", "there")
+                whom = f"{self.name(one.member)} {how} track {self.label(one.other)}"
+                said.append(f"{whom} at {at} s: it fits better {where}.")
             elif one.what == "took in" and one.other is not None:
                 said.append(f"It took in track {self.label(one.other)} at {at} s.")
             elif one.what == "split off it:" and one.other is not None:
@@ -243,6 +250,8 @@ class _Teller:
         story, config = self.story, self.mission.config
         assert story.ended is not None
         at, reason, heir = story.ended
+        if heir is not None and MERGED in story.ordered:
+            return f"{reason} into track {self.label(heir)} by an operator's order"
         if heir is not None:
             return f"{reason} into track {self.label(heir)}, the older one, with which it agreed"
         if reason == "ordered":

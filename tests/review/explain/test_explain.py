@@ -15,13 +15,15 @@ import schemas
 from fusion_service.centre import Order
 from fusion_service.cli import main
 from fusion_service.errors import ReviewError
+from fusion_service.order import LocalId
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.review.explain import explanation, listing, read_mission
 from schemas import GlobalTracks, LocalTracks, StepLog, Truth
+from schemas.messages import BROKEN, EXCHANGED, GATE_FAILED, MERGED, SPLIT
 from tests.centre.worlds import FRAME, SECOND, SPACE, START, info, tracks
 from tests.helpers.flown import Flight, places, raws
 
-GATE, KEEP = (f"{chi2.ppf(p, 4):.1f}" for p in (0.999, 0.9999))
+GATE, KEEP, MERGE = (f"{chi2.ppf(p, 4):.1f}" for p in (0.999, 0.9999, 0.99))
 
 
 def told(path: Path, track: str, **asked: Any) -> str:
@@ -38,79 +40,161 @@ def spread(at: float) -> Sequence[float]:
     return (at, 0.0)
 
 
+def decided(flight: Flight, kind: int) -> list[tuple[str, float]]:
+    """The second, as the story tells it, and the d2 of every decision of this kind."""
+    return [
+        (f"{step:.1f}", float(value))
+        for step, one in enumerate(flight.steps)
+        for value in one.log.decisions.value[one.log.decisions.kind == kind]
+    ]
+
+
+def only(flight: Flight, kind: int) -> str:
+    """The second of the one decision of this kind."""
+    ((second, _),) = decided(flight, kind)
+    return second
+
+
 @pytest.fixture(scope="module")
 def joined(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Flight]:
-    """r1 and r2 see one target as two for 3 s: tracks 1 and 2 are merged; r3 comes at 6 s; from 10 s on r2 sees its
-    track 2 km away: the link is broken after three steps, and track 3 is split off. r3 is silent from 14 s."""
-    flight = Flight({"coast": 3.0, "merge_after": 3, "break_after": 3})
+    """r1 and r2 see one target as two that come together: tracks 1 and 2 are merged; r3 comes at 8 s; from 12 s on r2
+    sees its track too far away, from 15 s on 2 km away: the link is broken, and track 3 is split off. r3 is silent from
+    18 s."""
+    flight = Flight({"coast": 3.0})
+    far = {1: 300, 2: 200, 3: 120, 4: 50, 12: 340, 13: 350, 14: 360}
 
     def seen_by(name: str, second: float) -> dict[int, Sequence[float]]:
         if name == "r1":
             return {11: spread(0)}
         if name == "r2":
-            return {22: spread(5000 if second == 1 else 20 if second < 10 else 1900 + 10 * second)}
-        return {33: spread(-20)} if 6 <= second < 14 else {}
+            return {22: spread(far.get(round(second), 20 if second < 12 else 2000))}
+        return {33: spread(-20)} if 8 <= second < 18 else {}
 
-    places(flight, range(1, 17), seen_by)
+    places(flight, range(1, 21), seen_by)
     return flight.record(tmp_path_factory.mktemp("explain") / "joined.rrd"), flight
+
+
+LAST = "19.0"
+"""Second of the last step of that mission."""
 
 
 def test_a_merge_is_told_of_both_tracks(joined: tuple[Path, Flight]) -> None:
     path, flight = joined
+    at = only(flight, MERGED)
     younger = told(path, "2")
     assert line(younger, "born").split() == ["0.0", "born"]
     assert line(younger, "r2 22 linked").startswith("0.0")
     merged = line(younger, "merged into 1")
-    assert merged.startswith("3.0")
-    assert f"of gate {GATE}" in merged
-    assert "It ended at 3.0 s: merged into track 1, the older one, with which it agreed." in younger
-    assert "Track 1, from r1, r2, r3, lived from 0.0 to 15.0 s." in younger
+    assert merged.startswith(at)
+    assert f"of gate {MERGE}" in merged
+    assert f"It ended at {at} s: merged into track 1, the older one, with which it agreed." in younger
+    assert f"Track 1, from r1, r2, r3, lived from 0.0 to {LAST} s." in younger
     older = told(path, "1")
-    assert line(older, "took in 2").startswith("3.0")
-    assert line(older, "r2 22 comes over from 2").startswith("3.0")
-    assert "It took in track 2 at 3.0 s." in older
+    assert line(older, "took in 2").startswith(at)
+    assert line(older, "r2 22 comes over from 2").startswith(at)
+    assert f"It took in track 2 at {at} s." in older
     assert "r2 22 and r3 33 joined later." in older
-    ((_, _, heir),) = flight.steps[3].tracks.ended
+    ((_, _, heir),) = flight.steps[int(float(at))].tracks.ended
     assert heir == flight.steps[0].tracks.ids[0]
 
 
 def test_a_broken_link_and_a_split_are_told_with_their_distances(joined: tuple[Path, Flight]) -> None:
     path, flight = joined
     text = told(path, "1")
-    logs = [one.log for one in flight.steps]
-    failed = [log.decisions.value[(log.decisions.kind == 3) & (log.decisions.id == 22)] for log in logs]
-    (first, second, third) = (float(values[0]) for values in failed if len(values))
-    low, high = min(first, second, third), max(first, second, third)
+    failed = decided(flight, GATE_FAILED)
+    assert len(failed) == 3
+    low, high = min(value for _, value in failed), max(value for _, value in failed)
+    assert low < high
     outside = line(text, "r2 22 outside its gate")
-    assert outside.startswith("9.0-11.0")
+    assert outside.startswith(f"{failed[0][0]}-{failed[-1][0]}")
     assert f"3 steps, d2 {low:.1f}-{high:.1f} of gate {KEEP}" in outside
+    ((at, value),) = decided(flight, BROKEN)
+    assert at == only(flight, SPLIT)
     broken = line(text, "r2 22 broken off")
-    assert broken.startswith("11.0")
-    assert f"d2 {third:.1f} of gate {KEEP}" in broken
-    assert line(text, "split off it: 3").startswith("11.0")
-    assert "r2 22 was broken off at 11.0 s: too far from the others. Track 3 was split off it at 11.0 s." in text
+    assert broken.startswith(at)
+    assert f"d2 {value:.1f} of gate {KEEP}" in broken
+    assert "r2 22 leaves" not in text
+    assert line(text, "split off it: 3").startswith(at)
+    assert f"r2 22 was broken off at {at} s: too far from the others. Track 3 was split off it at {at} s." in text
     child = told(path, "3")
-    assert "Track 3 was born at 11.0 s from r2 22, split from track 1 with which it no longer agreed" in child
-    assert "Track 1, from r1, r2, r3, lived from 0.0 to 15.0 s." in child
+    assert f"Track 3 was born at {at} s from r2 22, split from track 1 with which it no longer agreed" in child
+    assert f"Track 1, from r1, r2, r3, lived from 0.0 to {LAST} s." in child
     assert "It was still there at the end of the recording." in child
+
+
+def test_an_exchange_is_told_of_both_tracks(tmp_path: Path) -> None:
+    """r2 changes the numbers of two targets abeam of each other: the sources' pairs are exchanged, the tracks stay."""
+    flight = Flight({"coast": 3.0})
+    seen = {"r1": ((0, 0), (0, 90)), "r2": ((0, 10), (0, 80)), "r3": ()}
+
+    def seen_by(name: str, second: float) -> dict[int, Sequence[float]]:
+        at = seen[name] if second < 3 or name != "r2" else seen[name][::-1]
+        return dict(enumerate(at, 1))
+
+    places(flight, range(1, 9), seen_by)
+    path = flight.record(tmp_path / "mission.rrd")
+    moves = {
+        (f"{step:.1f}", log.sources[source], local, track & 0xFF, other & 0xFF, f"{value:.1f}")
+        for step, log in enumerate(one.log for one in flight.steps)
+        for kind, track, source, local, other, value in zip(
+            *(getattr(log.decisions, name).tolist() for name in ("kind", "track", "source", "id", "other", "value")),
+            strict=True,
+        )
+        if kind == EXCHANGED
+    }
+    assert {(one[3], one[4]) for one in moves} == {(1, 2), (2, 1)}
+    for at, source, local, to, was, d2 in moves:
+        new, old = told(path, str(to)), told(path, str(was))
+        came = line(new, f"{source} {local} comes over by exchange from {was}")
+        assert came.startswith(at)
+        assert f"d2 {d2} of gate {GATE}" in came
+        assert line(old, f"{source} {local} goes over by exchange to {to}").startswith(at)
+        assert f"{source} {local} came over from track {was} at {at} s: it fits better here." in new
+        assert f"{source} {local} went over to track {to} at {at} s: it fits better there." in old
+        for text in (new, old):
+            assert "is a part" not in text
+            assert f"{source} {local} leaves" not in text
+
+
+def test_a_merge_and_a_split_by_order_are_told_as_such(tmp_path: Path) -> None:
+    """An operator says that two tracks 20 km apart are one, and another that the older source's goes its own way: of
+    agreement and disagreement nothing is said."""
+    flight = Flight({"coast": 3.0})
+    at: dict[str, dict[int, Sequence[float]]] = {"r1": {1: spread(0)}, "r2": {2: spread(20_000)}, "r3": {3: spread(10)}}
+    places(flight, range(1, 4), lambda name, second: at[name])
+    first, second = flight.steps[-1].tracks.ids.tolist()
+    flight.centre.handle(Order("merge", track=first, other=second, who="anna", why="one hull"), START)
+    flight.centre.handle(Order("split", track=first, local=LocalId("r3", -1, 3), who="anna"), START)
+    places(flight, range(4, 6), lambda name, second: at[name])
+    path = flight.record(tmp_path / "mission.rrd")
+    orders = [event for event in flight.steps[3].log.events if event["kind"] == "order"]
+    assert [event["done"] for event in orders] == [True, True]
+    text = told(path, "2")
+    assert "It ended at 3.0 s: merged into track 1 by an operator's order." in text
+    assert line(text, "order to merge it by anna (one hull)").startswith("3.0")
+    assert "agreed" not in text
+    text = told(path, "3")
+    assert "Track 3 was born at 3.0 s from r3 3, split from track 1 by an operator's order" in text
+    assert "agreed" not in text
 
 
 def test_contributions_are_those_of_the_picture(joined: tuple[Path, Flight]) -> None:
     path, flight = joined
-    text = told(path, "1", at="7")
-    picture = flight.steps[7].tracks
+    text = told(path, "1", at="9")
+    picture = flight.steps[9].tracks
     influence = picture.contributor_influence[: picture.contributor_counts[0]]
-    assert "contributions at 7.0 s (step 8, confirmed)" in text
+    assert "contributions at 9.0 s (step 10, confirmed)" in text
     for name, part in zip(("r1 11", "r2 22", "r3 33"), influence.tolist(), strict=True):
         (row,) = (one for one in text.splitlines() if re.match(rf"{name}\s+\d", one))
         cells = row.split()[2:]
         assert cells[0] == f"{part:.2f}"
         assert cells[-1] == "30"  # m, the standard deviation that the sources state
         assert cells[-2] == "0.0"
-    same = told(path, "1", at="2023-11-14T22:13:28Z")
+    same = told(path, "1", at="2023-11-14T22:13:30Z")
     assert START == 1_700_000_000 * SECOND
-    assert "contributions at 7.0 s" in same
-    with pytest.raises(ReviewError, match=r"was not there at 5.0 s: it lived from 11.0 to 15.0 s"):
+    assert "contributions at 9.0 s" in same
+    split = only(flight, SPLIT)
+    with pytest.raises(ReviewError, match=rf"was not there at 5.0 s: it lived from {split} to {LAST} s"):
         told(path, "3", at="5")
     for wrong in ("soon", "nan", "1e30"):
         with pytest.raises(ReviewError, match="--at"):
@@ -120,7 +204,7 @@ def test_contributions_are_those_of_the_picture(joined: tuple[Path, Flight]) -> 
 def test_who_leaves_and_why(joined: tuple[Path, Flight]) -> None:
     text = told(joined[0], "1")
     assert "r3 33 leaves: the source lists it no more" in line(text, "r3 33 leaves")
-    assert line(text, "r3 33 leaves").startswith("13.0")
+    assert line(text, "r3 33 leaves").startswith("17.0")
     assert re.search(r"r1 11 kept \d+ steps?, d2 [\d.]+", text)
 
 
@@ -207,13 +291,33 @@ def test_labels_are_found_as_they_are_given() -> None:
 
 
 def test_many_spells_outside_the_gate_are_one_line(tmp_path: Path) -> None:
-    """r2 is far off at every other step: never three times in a row, so that its link stands."""
+    """r2 is 250 m off at every other step: outside its gate, but never so far that the link breaks."""
     flight = Flight({})
-    far = {"r1": lambda s: 0.0, "r2": lambda s: 3000.0 if s > 3 and s % 2 else 10.0, "r3": lambda s: -10.0}
+    far = {"r1": lambda s: 0.0, "r2": lambda s: 250.0 if s > 3 and s % 2 else 10.0, "r3": lambda s: -10.0}
     places(flight, range(1, 31), lambda name, second: {1: spread(far[name](second))})
+    assert len(decided(flight, GATE_FAILED)) == 13
+    assert not decided(flight, BROKEN)
     text = told(flight.record(tmp_path / "mission.rrd"), "1")
     one = line(text, "r2 1 kept")
     assert re.search(r"^1\.0-29\.0 +r2 1 kept 16 steps, outside its gate 13 in 13 spells, d2 ", one)
+    assert "leaves" not in text
+
+
+def test_what_is_left_out_and_then_dropped_leaves(tmp_path: Path) -> None:
+    """r2's track is far off at 4 and 5 s, and in its next scan no more."""
+    flight = Flight({"coast": 3.0})
+
+    def seen_by(name: str, second: float) -> dict[int, Sequence[float]]:
+        if name == "r2":
+            return {2: spread(250.0 if second > 3 else 0.0)} if second < 6 else {}
+        return {1: spread(0)}
+
+    places(flight, range(1, 9), seen_by)
+    failed = decided(flight, GATE_FAILED)
+    assert failed
+    text = told(flight.record(tmp_path / "mission.rrd"), "1")
+    assert line(text, "r2 2 outside its gate").startswith(failed[0][0])
+    assert line(text, "r2 2 leaves: the source lists it no more").startswith("5.0")
 
 
 def test_the_view_holds_the_track_its_members_and_its_truth(joined: tuple[Path, Flight], tmp_path: Path) -> None:
@@ -223,7 +327,8 @@ def test_the_view_holds_the_track_its_members_and_its_truth(joined: tuple[Path, 
     messages = [schemas.decode(raw.data) for raw in raws(out)]
     child = int(flight.steps[-1].tracks.ids[-1])
     shown = [message for message in messages if isinstance(message, GlobalTracks)]
-    assert [len(message.ids) for message in shown] == [0] * 11 + [1] * 5
+    split = int(float(only(flight, SPLIT)))
+    assert [len(message.ids) for message in shown] == [0] * split + [1] * (20 - split)
     assert {track for message in shown for track in message.ids.tolist()} == {child}
     assert all(len(message.contributor_id) == len(message.ids) for message in shown)
     whole = flight.steps[-1].tracks
@@ -288,7 +393,7 @@ def test_without_logs_the_pictures_tell_what_they_can(joined: tuple[Path, Flight
     bare = record(tmp_path / "bare.rrd", edited(flight.log, lambda m: None if isinstance(m, StepLog) else m))
     text = told(bare, "1")
     assert "gates" not in text
-    assert line(text, "r3 33 is a part").startswith("5.0")
+    assert line(text, "r3 33 is a part").startswith("7.0")
     only = record(
         tmp_path / "local.rrd", [(schemas.local_key("r1", "tracks"), schemas.encode(tracks("r1", 1, [])), START)]
     )
