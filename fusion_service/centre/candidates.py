@@ -150,9 +150,13 @@ class _Without:
         return mean, covariance
 
     def _distances(self, row: Ints, track: Ints) -> tuple[Floats, Floats]:
-        mean, covariance = self.state(row, track)
-        spread = covariance + self._rows.tracks.covariance[:, :, row]
-        return linalg.quadratic(spread, self._rows.tracks.mean[:, row] - mean), linalg.logdet(spread)
+        distance, size = np.empty(len(row)), np.empty(len(row))
+        for part in linalg.blocks(len(self._mean), len(row)):
+            mean, covariance = self.state(row[part], track[part])
+            spread = covariance + self._rows.tracks.covariance[:, :, row[part]]
+            distance[part] = linalg.quadratic(spread, self._rows.tracks.mean[:, row[part]] - mean)
+            size[part] = linalg.logdet(spread)
+        return distance, size
 
     def cost(self, row: Ints, track: Ints) -> Floats:
         """d2 + log det (K,)."""
