@@ -277,7 +277,7 @@ def test_a_track_of_an_intensity_ends_in_the_new_era_as_in_the_old() -> None:
             covariances=np.diag([900.0, 900.0, 4.0, 4.0])[None],
         )  # fmt: skip
         made.handle(message, ns(HOUR + k + 0.1))
-        step(made, HOUR + k)
+        made.step(ns(HOUR + k))
     result = [made.step(ns(HOUR + k)) for k in range(8, 16)][-1]
     assert result.tracks.status.tolist() == [2]
     made.handle(ClockSet(ns(8)), ns(8))

@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import msgpack
 import numpy as np
 import pytest
 
 import schemas
 from fusion_service.centre import FusionCentre, LocalId, Order, SourceFound, StepResult
+from fusion_service.centre.candidates import MOST_RIVALS
 from schemas.messages import IDENTITY_ORDERED, KEPT, MERGED, SPLIT
-from tests.centre.worlds import give, info, step, tracks
+from tests.centre.worlds import centre, give, info, step, tracks
 from tests.helpers import random_missions
 from tests.helpers.random_missions import Mission
 
@@ -160,3 +162,14 @@ def test_a_source_that_is_known_but_was_never_heard() -> None:
     """Its token is there, and the config says what it is: it may be used, and has nothing."""
     world = World(sources={"r9": {"override": True}})
     assert len(world.go(1, SourceFound("r9")).tracks.ids) == 2
+
+
+def test_rivals_are_few_where_all_tracks_coincide() -> None:
+    """100 coincident tracks of two sources, each followed under its own id: sums for the nearest of them alone."""
+    crowd = centre(("r1", "r2"))
+    for second in range(1, 4):
+        give(crowd, *(tracks(name, second, np.zeros((100, 4))) for name in ("r1", "r2")))
+        assert len(step(crowd, second).tracks.ids) == 100
+    known = msgpack.unpackb(crowd.checkpoint())["own"]["rivals"]
+    assert [name for name, *_ in known] == ["r1", "r2"]
+    assert all(0 < len(ids) // 8 <= 100 * MOST_RIVALS for _, ids, _, _ in known)
