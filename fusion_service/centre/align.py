@@ -52,7 +52,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         kept[name] = count
         parts.append(predicted.take(sound))
         index.append(np.full(count, number, dtype=np.intp))
-        epochs.append(np.full(count, source.epoch, dtype=np.uint64))
+        epochs.append(np.full(count, max(source.epoch, 0), dtype=np.uint64))  # -1: nothing was heard of it yet
         starts.append(np.full(count, said.may_start, dtype=np.bool_))
         interval.append(table.interval[sound])
         lost.append(np.full(count, source.alive is False, dtype=np.bool_))

@@ -27,6 +27,8 @@ __all__ = ["Candidates", "Pairs", "find_candidates"]
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
+MOST_RIVALS = 32
+"""Tracks near its own that a believed row may be exchanged to, the nearest: bounds a step where all tracks coincide."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -150,9 +152,13 @@ class _Without:
         return mean, covariance
 
     def _distances(self, row: Ints, track: Ints) -> tuple[Floats, Floats]:
-        mean, covariance = self.state(row, track)
-        spread = covariance + self._rows.tracks.covariance[:, :, row]
-        return linalg.quadratic(spread, self._rows.tracks.mean[:, row] - mean), linalg.logdet(spread)
+        distance, size = np.empty(len(row)), np.empty(len(row))
+        for part in linalg.blocks(len(self._mean), len(row)):
+            mean, covariance = self.state(row[part], track[part])
+            spread = covariance + self._rows.tracks.covariance[:, :, row[part]]
+            distance[part] = linalg.quadratic(spread, self._rows.tracks.mean[:, row[part]] - mean)
+            size[part] = linalg.logdet(spread)
+        return distance, size
 
     def cost(self, row: Ints, track: Ints) -> Floats:
         """d2 + log det (K,)."""
@@ -183,13 +189,18 @@ def _gated(means: Floats, covariances: Floats, i: Ints, j: Ints, gates: Floats, 
 
 
 def _near_own(rows: Rows, now: Picture, inside: Ints, near: Pairs, known: Ints) -> tuple[Ints, Ints]:
-    """Every believed row with a new datum, and each track near its own: (row, track)."""
+    """Every believed row with a new datum, and each track near its own, `MOST_RIVALS` at most: (row, track)."""
     fresh = inside[rows.fresh[inside]]
     if not len(near.first) or not len(fresh):
         return fresh[:0], fresh[:0]
     a, b = known[near.first], known[near.second]
     one, other = np.concatenate([a, b]), np.concatenate([b, a])
-    order = np.lexsort((other, one))
+    distance = np.concatenate([near.distance, near.distance])
+    order = np.lexsort((other, distance, one))
+    begins = np.flatnonzero(np.diff(one[order], prepend=-1))
+    rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
+    order = np.sort(order[rank < MOST_RIVALS])
+    order = order[np.lexsort((other[order], one[order]))]
     one, other = one[order], other[order]
     own = now.find(rows.tracks.link[fresh])
     first, last = np.searchsorted(one, own, "left"), np.searchsorted(one, own, "right")

@@ -112,6 +112,7 @@ class Centre(ABC):
         self._intake.rebase(time, now)
         self._labels.rebase(time)
         self._picture = rebased(self._picture, GLOBAL_TIMES, time)
+        self._rebase(time)
 
     def step(self, time: int) -> StepResult:
         """Make the step at `time`, ns, which must be after the last. `ValueError` if it is not."""
@@ -190,6 +191,10 @@ class Centre(ABC):
     @abstractmethod
     def _restore(self, state: dict[str, Any]) -> None:
         """Go on with what `_kept` gave."""
+
+    @abstractmethod
+    def _rebase(self, time: int) -> None:
+        """A new era begins at `time`, ns: nothing that this kind has of its own is later."""
 
     @property
     @abstractmethod

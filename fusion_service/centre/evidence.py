@@ -116,6 +116,10 @@ class PairEvidence:
         full = [(-total, pair) for pair, (total, _, _) in self.pairs.items() if total >= bound - 1e-9]
         return [pair for _, pair in sorted(full)]
 
+    def rebase(self, time: int) -> None:
+        """A new era begins at `time`, ns: no datum is later."""
+        self.pairs = {pair: (total, min(a, time), min(b, time)) for pair, (total, a, b) in self.pairs.items()}
+
     def forget(self, tracks: set[int]) -> None:
         """Drop the pairs of these global ids."""
         self.pairs = {pair: kept for pair, kept in self.pairs.items() if not tracks & set(pair)}

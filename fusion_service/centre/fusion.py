@@ -49,6 +49,10 @@ class FusionCentre(Centre):
         self._entries = Entries.unpacked(state["entries"])
         self._last = self._time
 
+    def _rebase(self, time: int) -> None:
+        self._linker.merges.rebase(time)
+        self._last = min(self._last, time)
+
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         self._associate(rows, names, time)
         self._picture, influence = fuse_all(rows, self._predicted(time), time, self.config, self._journal)

@@ -90,6 +90,9 @@ class IntensityCentre(Centre):
     def _forget(self, tracks: Iterable[int]) -> None:
         """What is remembered goes by the ids in the picture."""
 
+    def _rebase(self, time: int) -> None:
+        self._memory = replace(self._memory, supported=np.minimum(self._memory.supported, time))
+
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         new = self._news(names)
         self._fused = self._fuse(rows, names, time)

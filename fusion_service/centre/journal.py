@@ -113,7 +113,9 @@ class Journal:
             self._column(kind, tracks, none + NO_SOURCE, none, none, none if other is None else other, value)
 
     def _column(self, kind: int, *columns: NDArray[Any]) -> None:
-        self._columns.append((np.full(len(columns[0]), kind), *columns))
+        # each in its own type from the start: u64 and i64 together would become floats, and ids lose their last bits
+        whole = np.full(len(columns[0]), kind), *columns
+        self._columns.append(tuple(column.astype(dtype) for column, dtype in zip(whole, _DTYPES, strict=True)))
 
     def birth(self, ids: NDArray[np.uint64]) -> None:
         """New global tracks."""
@@ -121,7 +123,10 @@ class Journal:
 
     def merge(self, old: int, new: int, distance: float) -> None:
         """`new` goes on as `old`."""
-        self._column(messages.MERGED, *(np.array([value]) for value in (new, NO_SOURCE, 0, 0, old, distance)))
+        self._column(
+            messages.MERGED,
+            *(np.array([value]) for value in (np.uint64(new), NO_SOURCE, 0, 0, np.uint64(old), distance)),
+        )
         self._ended.append((new, "merged", old))
 
     def split(self, new: int, old: int) -> None:

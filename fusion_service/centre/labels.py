@@ -64,14 +64,15 @@ class Labels:
         self.twice.rebase(time)
 
     def columns(self, ids: Ids, origin: str) -> dict[str, Any]:
-        """The optional columns of `GlobalTracks` for the tracks of the last step; None where they say nothing. origin:
-        of the message."""
+        """The optional columns of `GlobalTracks` for some tracks of the last step, sorted; without those that say
+        nothing. origin: of the message."""
         identity, identity_p = self.identities.named(ids)
         kind, kind_p = self.identities.classed(ids)
-        said, marks = self._intake.said, self._marks(ids)
+        at = np.searchsorted(self.compartments.track, ids)
+        said, marks = self._intake.said, self._marks(ids, at)
         number, callsign = self._called(ids)
         # an intensity is of all sources, and so are its tracks
-        own = self.compartments.origin if self._intake.config.kind == "tracks" else np.zeros(0, dtype=np.uint8)
+        own = self.compartments.origin[at] if self._intake.config.kind == "tracks" else np.zeros(0, dtype=np.uint8)
         return {
             **_if((identity != NONE).any(), identity=said.identity.said(identity), identity_p=identity_p),
             **_if((kind != NONE).any(), kind=said.kind.said(kind), kind_p=kind_p),
@@ -81,9 +82,9 @@ class Labels:
             **_if(any(callsign), callsign=tuple(callsign)),
         }
 
-    def _marks(self, ids: Ids) -> NDArray[np.uint8]:
+    def _marks(self, ids: Ids, at: NDArray[np.intp]) -> NDArray[np.uint8]:
         twice, ordered = ([*some] for some in (self.twice.tracks(), self.identities.ordered()))
-        marks = np.where(self.compartments.apart != NONE, APART, 0).astype(np.uint8)
+        marks = np.where(self.compartments.apart[at] != NONE, APART, 0).astype(np.uint8)
         for tracks, bit in ((twice, IDENTITY_TWICE), (ordered, IDENTITY_ORDERED)):
             if tracks:
                 marks[np.isin(ids, np.array(tracks, dtype=np.uint64))] |= bit

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fusion_service import linalg
 from fusion_service.centre.births import group
-from fusion_service.centre.candidates import Candidates, Pairs, find_candidates
+from fusion_service.centre.candidates import Candidates, find_candidates
 from fusion_service.centre.evidence import LOW, PairEvidence, RivalLinks, Tests
 from fusion_service.centre.gating import Judgement, Settings, judge
 from fusion_service.centre.ids import Ids
@@ -138,8 +138,8 @@ class Linker:
         rivals, sums = near.rivals.take(mine), sums[mine]
         believed = np.unique(rivals.first)
         loose = np.unique(joins.first)
-        standing = np.concatenate([believed, loose[tracks.link[loose] != NO_TRACK], _holders(rows, now, joins, name)])
-        standing = np.unique(standing)
+        holders = _holders(rows, now, np.concatenate([joins.second, rivals.second]), name)
+        standing = np.unique(np.concatenate([believed, loose[tracks.link[loose] != NO_TRACK], holders]))
         at = now.find(tracks.link[standing])
         stay = np.where(tracks.outside[standing], 0.5, STANDING + weight[standing])
         row = np.concatenate([joins.first, rivals.first, standing])
@@ -310,11 +310,11 @@ def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
     return np.isin(rows.source[row] * width + track, keys)
 
 
-def _holders(rows: Rows, now: Picture, joins: Pairs, name: int) -> Ints:
-    """The rows of the source that stand in a track that a loose row of it may join."""
-    wanted = np.unique(now.id[joins.second])
+def _holders(rows: Rows, now: Picture, wanted: Ints, name: int) -> Ints:
+    """The rows of the source that stand in a track that another row of it may join or exchange its own for."""
+    ids = np.unique(now.id[wanted])
     mine = np.flatnonzero((rows.source == name) & (rows.tracks.link != NO_TRACK))
-    return mine[np.isin(rows.tracks.link[mine], wanted)]
+    return mine[np.isin(rows.tracks.link[mine], ids)]
 
 
 def _in_clusters(row: Ints, track: Ints, reason: Ints, rows: int, tracks: int) -> Bools:

@@ -5,6 +5,7 @@ Expected places are those of the target's straight line, errors are counted in t
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import schemas
-from fusion_service.centre import ClockSet, FusionCentre, NewEra, StepResult, WallClock
+from fusion_service.centre import ClockSet, FusionCentre, IntensityCentre, NewEra, StepResult, WallClock
 from fusion_service.centre.era import FEW, margin
+from fusion_service.centre.evidence import PairEvidence
+from fusion_service.centre.lifecycle import newborn
 from fusion_service.config import CentreConfig
 from fusion_service.review.replay import run_replay
 from tests.centre.worlds import SECOND, SIGMA, START, centre, give, info, seen, step, tracks
@@ -247,3 +250,37 @@ def test_the_wall_clock_goes_on_from_where_it_was_set() -> None:
     assert one.due(ns(-3590.0)) == ns(-3591)
     assert one.due(ns(-3590.0)) is None
     assert one.due(ns(-3588.5)) == ns(-3589)
+
+
+def test_evidence_for_a_merge_goes_on_from_the_data_of_the_new_era() -> None:
+    """It does not wait until the clock is where it was."""
+    evidence, first, second = PairEvidence(), np.array([0]), np.array([1])
+    ids = newborn(np.array([3, 4], dtype=np.uint64), 4, 0)
+    for time in (100, 101):
+        evidence.add(first, second, np.array([1.0]), replace(ids, seen=np.array([time, time])), 10.0)
+    assert evidence.pairs[3, 4][0] == 2.0
+    evidence.rebase(50)
+    evidence.add(first, second, np.array([1.0]), replace(ids, seen=np.array([50, 50])), 10.0)
+    assert evidence.pairs[3, 4][0] == 2.0
+    evidence.add(first, second, np.array([1.0]), replace(ids, seen=np.array([51, 51])), 10.0)
+    assert evidence.pairs[3, 4][0] == 3.0
+
+
+def test_a_track_of_an_intensity_ends_in_the_new_era_as_in_the_old() -> None:
+    """One that coasts at the set-back does not live until the clock is where it was."""
+    made = IntensityCentre({"kind": "intensity", "coast": 20.0, "lateness": 1.0})
+    made.handle(info("r1"), START)
+    for k in range(1, 8):
+        message = schemas.LocalIntensity(
+            source="r1", epoch=1, seq=k, sent=0, time=ns(HOUR + k), space=("x", "y", "vx", "vy"),
+            frame=tracks("r1", 0, []).frame, weights=np.array([1.0]), means=LINE[None],
+            covariances=np.diag([900.0, 900.0, 4.0, 4.0])[None],
+        )  # fmt: skip
+        made.handle(message, ns(HOUR + k + 0.1))
+        made.step(ns(HOUR + k))
+    result = [made.step(ns(HOUR + k)) for k in range(8, 16)][-1]
+    assert result.tracks.status.tolist() == [2]
+    made.handle(ClockSet(ns(8)), ns(8))
+    left = [len(made.step(ns(k)).tracks.ids) for k in range(8, 60)]
+    assert left[0] == 1
+    assert left[-1] == 0
