@@ -107,7 +107,8 @@ def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtu
     by_existence = config.mixture_rule == "aa" and not config.mixture_options
     weights = _shares(rows, members[several]) if by_existence else None
     parts, _ = fuse_mixtures_last(config.mixture_rule, sources, weights, **options)
-    mean, covariance = parts.moments()
+    with np.errstate(invalid="ignore"):  # of sources that rule each other out there is no mass left
+        mean, covariance = parts.moments()
     sound = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
     several[np.flatnonzero(several)[~sound]] = False
     return parts.take(sound), several

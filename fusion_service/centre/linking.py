@@ -273,7 +273,9 @@ class Linker:
                 merged[new] = old
                 journal.merge(old, new, far[old, new])
                 moved = np.flatnonzero(rows.tracks.link == np.uint64(new))
+                outside = rows.tracks.outside[moved]
                 set_links(rows.tracks, moved, np.uint64(old), step)
+                rows.tracks.outside[moved] = outside
         self.merges.forget(taken)
         return merged
 
