@@ -23,7 +23,7 @@ from schemas.messages import BROKEN, EXCHANGED, GATE_FAILED, MERGED, SPLIT
 from tests.centre.worlds import FRAME, SECOND, SPACE, START, info, tracks
 from tests.helpers.flown import Flight, places, raws
 
-GATE, KEEP, MERGE = (f"{chi2.ppf(p, 4):.1f}" for p in (0.999, 0.9999, 0.99))
+GATE, KEEP, MERGE = (f"{chi2.ppf(p, 4):.1f}" for p in (0.999, 0.9999, 0.999))
 
 
 def told(path: Path, track: str, **asked: Any) -> str:
