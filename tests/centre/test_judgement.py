@@ -13,7 +13,7 @@ import pytest
 from scipy.optimize import linear_sum_assignment
 
 import schemas
-from fusion_service.centre import FusionCentre, StepResult
+from fusion_service.centre import FusionCentre, SourceFound, SourceLost, StepResult
 from schemas.messages import COASTING, CONFIRMED, EXCHANGED, GATE_FAILED, TENTATIVE
 from tests.centre.worlds import SECOND, START, centre, give, info, step, tracks
 from tests.helpers.strategies import Array
@@ -325,6 +325,22 @@ def test_a_track_that_is_only_predicted_on_coasts_and_ends() -> None:
         if second == 14:
             assert result.tracks.status.tolist() == [COASTING]
     assert len(result.tracks.ids) == 0
+
+
+def test_a_lost_token_begins_coasting_at_the_next_expected_report() -> None:
+    """Of a source of 4 s: at 4 s with its token gone, at 6 s (half an interval later) while it is there."""
+    begins: dict[bool, int] = {}
+    for lost in (False, True):
+        made = centre((), coast=30.0)
+        give(made, info("r1", period=4.0), SourceFound("r1"))
+        for second in range(1, 20):
+            if second in (1, 5, 9):
+                give(made, tracks("r1", second, [[0, 0, 0, 0]]))
+            if second == 10 and lost:
+                give(made, SourceLost("r1"))
+            if (step(made, second).tracks.status == COASTING).any():
+                begins.setdefault(lost, second)
+    assert begins == {True: 9 + 4 + 1, False: 9 + 6 + 1}
 
 
 def test_a_fast_source_on_a_slow_link_has_its_tracks() -> None:
