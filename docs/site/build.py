@@ -27,8 +27,8 @@ ELSEWHERE = {
 }
 """Pages that are not below docs/: path in the repository, name in the site."""
 SECTIONS = {
-    "Use it": ["tutorial", "operating", "rules", "mixtures", "review", "docker", "wire"],
-    "How good, how fast": ["measurements", "studies", "rules-speed"],
+    "Use it": ["tutorial", "operating", "judgement", "rules", "mixtures", "review", "docker", "wire"],
+    "How good, how fast": ["measurements", "worlds", "studies", "rules-speed"],
     "API": ["api/*"],
     "Carry it on": ["architecture", "decisions/README", "contributing", "changelog"],
 }
