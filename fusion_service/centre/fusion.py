@@ -54,8 +54,8 @@ class FusionCentre(Centre):
         self._last = min(self._last, time)
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
-        self._associate(rows, names, time)
-        self._picture, influence = fuse_all(rows, self._predicted(time), time, self.config, self._journal)
+        now = self._associate(rows, names, time)
+        self._picture, influence = fuse_all(rows, now, time, self.config, self._journal)
         self._live(rows, time)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
@@ -75,14 +75,18 @@ class FusionCentre(Centre):
                 link = to[np.searchsorted(old, source.tracks.link[at])]
                 source.tracks = relinked(source.tracks, at, link, self._step)
 
-    def _associate(self, rows: Rows, names: tuple[str, ...], time: int) -> None:
+    def _associate(self, rows: Rows, names: tuple[str, ...], time: int) -> Picture:
+        """Decide the links of the step; the picture that comes of it, predicted to `time`."""
         now = self._predicted(time)
+        count = len(now.id)
         meeting = Meeting(self._intake, self._labels, rows, now.id, names)
         self._picture, merged = self._linker.link(rows, self._picture, now, meeting, self._step, time, self._journal)
         self._relink(merged)
         if merged:
             gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
-            self._picture = self._picture.take(~gone)
+            self._picture, now = self._picture.take(~gone), now.take(~gone[:count])
+            count = len(now.id)
+        return now.join(self._picture.take(slice(count, None)))
 
     def _predicted(self, time: int) -> Picture:
         picture, config = self._picture, self.config

@@ -91,9 +91,29 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     for kind, which in ((messages.KEPT, stays & ~outside), (messages.GATE_FAILED, stays & outside)):
         journal.decide(kind, rows, linked[which], links[which], shown[which])
     inside = rows.inside()
-    if len(inside) != len(some) or len(failed):
-        agreed = consensus(tracks.link[inside], tracks.mean[:, inside], tracks.covariance[:, :, inside])
+    if len(inside) != len(some):
+        agreed = _without(agreed, rows, linked[some], inside)
     return Judgement(inside, agreed, broken, was)
+
+
+def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensus:
+    """What the rows `inside` say together, from what all of `had` said: only tracks that lost one are fused anew."""
+    tracks = rows.tracks
+    kept = np.isin(had, inside)
+    links = tracks.link[inside]
+    labels, group = np.unique(links, return_inverse=True)
+    at = np.searchsorted(agreed.labels, labels)
+    mean, covariance = agreed.mean[:, at], agreed.covariance[:, :, at]
+    others_mean, others_covariance = agreed.others_mean[:, kept], agreed.others_covariance[:, :, kept]
+    size = agreed.size[kept]
+    fewer = np.flatnonzero(size != np.bincount(group, minlength=len(labels))[group])
+    some = inside[fewer]
+    anew = consensus(links[fewer], tracks.mean[:, some], tracks.covariance[:, :, some])
+    changed = np.searchsorted(labels, anew.labels)
+    mean[:, changed], covariance[:, :, changed] = anew.mean, anew.covariance
+    others_mean[:, fewer], others_covariance[:, :, fewer] = anew.others_mean, anew.others_covariance
+    size[fewer] = anew.size
+    return Consensus(labels, mean, covariance, others_mean, others_covariance, size)
 
 
 def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings) -> Floats:

@@ -171,8 +171,10 @@ class Identities:
         trusted to be two objects."""
         forbidden = np.zeros(len(row), dtype=np.bool_)
         mine, asked, code = self._trusted(rows, row)
+        if not len(mine):
+            return forbidden
         linked, question, said = self._trusted(rows, rows.linked())
-        if not len(mine) or not len(linked):
+        if not len(linked):
             return forbidden
         link, width = rows.tracks.link[linked], len(self._intake.said.identity.texts)
         tracks = np.unique(link)
@@ -188,9 +190,9 @@ class Identities:
     def _trusted(self, rows: Rows, some: Ints) -> tuple[Ints, Codes, Codes]:
         """Of some rows those that have an identity from a source that is trusted, in order, and each its question and
         its answer."""
-        some = np.unique(some)
-        trust = self._stated("identity_trust", rows.source[some])
-        some = some[(rows.tracks.identity[some] != NONE) & (trust >= TRUSTED)]
+        some = np.unique(some[rows.tracks.identity[some] != NONE])
+        if len(some):
+            some = some[self._stated("identity_trust", rows.source[some]) >= TRUSTED]
         code = rows.tracks.identity[some]
         return some, self._intake.said.identity.schemes()[code], code
 
