@@ -17,12 +17,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 from fusion_service.densities import Mixtures, log_sum
 
 __all__ = ["by_size", "candidate_pairs", "cluster", "leave_one_out", "overlap", "pair_distance", "uniform_ci"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 Label = TypeVar("Label", bound=np.generic)
 
 LIGHTEST = 0.05

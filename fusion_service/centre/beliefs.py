@@ -15,11 +15,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.centre.words import NONE, Codes
 
 __all__ = ["CANDIDATES", "DEPTH", "OPEN", "Beliefs", "learned", "no_beliefs"]
 
-Floats = NDArray[np.float64]
 Ids = NDArray[np.uint64]
 CANDIDATES = 4
 OPEN = 0

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Ints
 from fusion_service.centre.candidates import Pairs
 from fusion_service.metrics import assign_near
 
 __all__ = ["group"]
-
-Ints = NDArray[np.intp]
 
 
 def group(at: Ints, source: Ints, pairs: Pairs, gate: NDArray[np.float64]) -> Ints:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.association import candidate_pairs, overlap, pair_distance
 from fusion_service.centre.gating import Judgement
 from fusion_service.centre.identity import Terms
@@ -24,9 +25,6 @@ from fusion_service.densities import Mixtures
 
 __all__ = ["Candidates", "Pairs", "find_candidates"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 MOST_RIVALS = 32
 """Tracks near its own that a believed row may be exchanged to, the nearest: bounds a step where all tracks coincide."""
 

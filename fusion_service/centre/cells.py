@@ -48,6 +48,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.association import by_size, candidate_pairs, cluster, pair_distance, uniform_ci
 from fusion_service.densities import Mixture, Mixtures, log_gaussian
 from fusion_service.existence import fuse_poisson
@@ -64,9 +65,6 @@ __all__ = [
     "reduced",
 ]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 Covering = Callable[[Floats], Bools]
 """Which of N sources declare a coverage that holds the means (n, M): (N, M)."""
 

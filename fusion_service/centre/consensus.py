@@ -12,12 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.association import by_size, uniform_ci
 
 __all__ = ["Consensus", "consensus"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 SOUND = 1e-8
 """Least pivot, relative to its variance, of an information matrix that is inverted; below, `uniform_ci` decides."""
 

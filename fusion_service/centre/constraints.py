@@ -12,13 +12,13 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Ints
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.order import LocalId
 
 __all__ = ["Constraints", "constraints", "find_rows"]
 
-Ints = NDArray[np.intp]
 Ids = NDArray[np.uint64]
 Kind = TypeVar("Kind", bound=np.generic)
 

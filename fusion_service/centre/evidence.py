@@ -13,7 +13,8 @@ tracks are merged when slope (q' - d2), summed over new data, reaches A, q' bein
 between the two lies the dead band in which a bias leaves things as they are.
 
 Rival links are weighed by the likelihood ratio itself, half the difference of d2 + log det to the standing link,
-summed over the row's new data and never below `-LOW`: an exchange needs `A` of them, less while the link is young.
+summed over the row's new data with a memory of four reports and never below `-LOW`; of two mature links an exchange
+needs `A` together, of young ones less. A link that was only just made breaks on one jump.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
 from fusion_service.config import CentreConfig
@@ -31,8 +33,6 @@ from fusion_service.metrics import chi2_quantile
 
 __all__ = ["LOW", "PairEvidence", "RivalLinks", "Tests"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 LOW = 12.0
 """Least sum of a rival: how much it must make good before it counts."""
 SLOPE = 0.2

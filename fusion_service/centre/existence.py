@@ -25,6 +25,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.centre.association import by_size
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
@@ -36,8 +37,6 @@ from fusion_service.existence import fuse_existence
 
 __all__ = ["Entries", "update_existence"]
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 MOST = float(np.log(0.9999 / 0.0001))
 """Log-odds beyond which nothing is believed or denied: from there a few data lead back."""

@@ -20,14 +20,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.config import CentreConfig
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 __all__ = ["HOLD", "Memory", "assign", "carried", "live", "next_number", "ranked"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 
 UNDECIDED = float(np.log(0.6 / 0.4))
 """Log odds within which a weight speaks for neither number."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
@@ -27,9 +28,6 @@ from fusion_service.rules.mixtures import fuse_mixtures_last
 from schemas import Entry
 
 __all__ = ["fuse_all"]
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 
 
 MOST_PRODUCTS = 4096

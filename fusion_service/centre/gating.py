@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -25,9 +26,6 @@ from schemas import messages
 
 __all__ = ["Judgement", "Settings", "judge", "manoeuvred"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 AXES = (("x", "vx", "ax"), ("y", "vy", "ay"), ("z", "vz", "az"))
 
 

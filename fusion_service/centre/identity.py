@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.beliefs import OPEN, Beliefs, learned, no_beliefs
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
@@ -25,8 +26,6 @@ from fusion_service.centre.words import NONE, Codes
 
 __all__ = ["MOST_CLASSES", "POPULATION", "TRUSTED", "Identities", "Terms"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
 Ids = NDArray[np.uint64]
 Mask = NDArray[np.bool_]
 

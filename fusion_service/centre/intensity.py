@@ -17,9 +17,9 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.association import candidate_pairs, pair_distance
 from fusion_service.centre.cells import Components, Stated, cells_and_reach, fuse_cells, reduced
 from fusion_service.centre.centre import Centre
@@ -37,9 +37,6 @@ from schemas import Entry, messages
 
 __all__ = ["IntensityCentre"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 
 SUPPORT = 0.5
 """What a source must have of the mean share in a component, of those that have any, to support its track."""

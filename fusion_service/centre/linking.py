@@ -19,6 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fusion_service import linalg
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.births import group
 from fusion_service.centre.candidates import Candidates, find_candidates
 from fusion_service.centre.evidence import LOW, PairEvidence, RivalLinks, Tests
@@ -35,9 +36,6 @@ from schemas import Entry, messages
 
 __all__ = ["Linker"]
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.intp]
-Bools = NDArray[np.bool_]
 MOST_BYTES = 12_000_000
 """Global tracks are not started beyond what one message can carry with room to spare."""
 STANDING = 1000.0
@@ -77,7 +75,7 @@ class Linker:
         merged = self._merge(rows, now, near, step, journal)
         free = near.loose[rows.tracks.link[near.loose] == NO_TRACK]
         starting = self._shadow(rows, now, near, meeting, free)
-        picture = self._begin(rows, picture, near, judged, free, starting, step, time, journal)
+        picture = self._begin(rows, picture, near, free, starting, step, time, journal)
         newly = np.concatenate([joined, free[rows.tracks.link[free] != NO_TRACK]])
         rows.tracks.seen[newly], rows.tracks.judged[newly] = time, rows.tracks.updated[newly]
         waiting = rows.tracks.link[near.loose] == NO_TRACK
@@ -91,7 +89,6 @@ class Linker:
         weight = self.tests.weight(rows.tracks.data)
         touched = np.zeros(len(now.id), dtype=np.bool_)
         joined: list[Ints] = [np.zeros(0, dtype=np.intp)]
-        moved: list[Ints] = [np.zeros(0, dtype=np.intp)]
         active = near.joins.first, near.rivals.first[sums > weight[near.rivals.first]]
         for name in np.unique(rows.source[np.concatenate(active)]).tolist():
             row, track, value, stays = self._options(rows, now, near, sums, weight, name, touched)
@@ -110,9 +107,9 @@ class Linker:
             touched[now.find(rows.tracks.link[row[taken[exchanged]]])] = True
             self._apply(rows, now, near, row[taken], track[taken], lost, step, journal)
             joined.append(row[taken])
-            moved.append(row[taken])
-        self._keep_rivals(rows, now, near, sums, np.concatenate(moved))
-        return np.concatenate(joined)
+        whole = np.concatenate(joined)
+        self._keep_rivals(rows, now, near, sums, whole)
+        return whole
 
     def _rival_sums(self, rows: Rows, now: Picture, near: Candidates) -> Floats:
         """The sum of every rival pair, this datum's share in it."""
@@ -222,7 +219,7 @@ class Linker:
         return np.asarray((tracks.shadow[free] == NO_TRACK) | (tracks.apart[free] >= tests.bound - 1e-9))
 
     def _begin(
-        self, rows: Rows, picture: Picture, near: Candidates, judged: Judgement, free: Ints, starting: Bools,
+        self, rows: Rows, picture: Picture, near: Candidates, free: Ints, starting: Bools,
         step: int, time: int, journal: Journal,
     ) -> Picture:  # fmt: skip
         """New tracks for the groups of free rows in which one may start and is nobody's shadow, or two sources agree
@@ -245,8 +242,7 @@ class Linker:
         given[chosen] = new
         takes = given[groups] != NO_TRACK
         set_links(tracks, free[takes], given[groups[takes]], step)
-        distance = np.full(len(free), np.nan)
-        journal.decide(messages.LINKED, rows, free[takes], given[groups[takes]], distance[takes])
+        journal.decide(messages.LINKED, rows, free[takes], given[groups[takes]], np.full(int(takes.sum()), np.nan))
         journal.birth(new)
         born = set(new.tolist())
         for row, old in journal.broken.items():

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Ints
 from fusion_service.centre.constraints import constraints
 from fusion_service.centre.identity import TRUSTED, Terms
 from fusion_service.centre.intake import Intake
@@ -20,7 +21,6 @@ from schemas import messages
 
 __all__ = ["Meeting"]
 
-Ints = NDArray[np.intp]
 Ids = NDArray[np.uint64]
 Mask = NDArray[np.bool_]
 

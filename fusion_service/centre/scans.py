@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import geodesy, linalg
+from fusion_service.arrays import Floats
 from fusion_service.centre.sources import Tracks, no_parts, unlinked
 from fusion_service.centre.words import Lexicon
 from fusion_service.densities import Mixtures, reduce_mixtures
@@ -17,7 +18,6 @@ from schemas import FAULTS, ORIGINS, Frame, Height, LocalIntensity, LocalTracks,
 
 __all__ = ["MAX_PERIOD", "Scan", "as_tracks", "fits", "is_sound", "message_tracks", "size_of"]
 
-Floats = NDArray[np.float64]
 
 MAX_PERIOD = 1e5
 MAX_WEIGHT = 1e3

@@ -15,6 +15,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
 from fusion_service.centre.words import Codes
@@ -38,7 +39,6 @@ __all__ = [
     "unlinked",
 ]
 
-Floats = NDArray[np.float64]
 Columns = TypeVar("Columns", bound="HasParts")
 
 REMEMBERED = 1024

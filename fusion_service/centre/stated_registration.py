@@ -8,8 +8,8 @@ the covariance of that (`position_covariance`, in its own frame); for a source t
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from fusion_service.arrays import Floats
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.sources import Source
 from fusion_service.geodesy import FrameError, transform
@@ -17,7 +17,6 @@ from schemas import Frame
 
 __all__ = ["stated_registration"]
 
-Floats = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
 LARGEST = 1e5
