@@ -151,7 +151,8 @@ class SensorInfo(Header):
 
     position (x, y, z) in `frame`, m, and its covariance (3, 3); period, initiation_delay in seconds;
     detection_probability in [0, 1] inside `coverage`; may_start: its tracks may start global tracks;
-    correlation_group: sources of one group share errors (one navigation system, say).
+    correlation_group: sources of one group share errors (one navigation system, say); feedback: its tracker is fed
+    with fused tracks, so that its tracks hold what others have measured.
     """
 
     type: ClassVar[str] = "sensor_info"
@@ -165,6 +166,7 @@ class SensorInfo(Header):
     may_start: bool = True
     position_covariance: Floats | None = None
     correlation_group: str | None = None
+    feedback: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -175,6 +177,7 @@ class GlobalTracks(Header):
     that the contributions index; contributor_counts (T,) u16 says how many of the K contributions each
     track has: source (index, u16), epoch and local id (u64), influence trace(K_i)/n of the gain K_i.
     ended: (id, reason, id of the track that replaces it or None); split_from: (new id, old id).
+    rules: the ways that tracks were fused by, and track_rule (T,) u8 the index of each track's.
     identity, kind: what it is, a text or None per track, with the probabilities identity_p and kind_p (T,);
     track_origin (T,) u8 index into `ORIGINS`; marks (T,) u8, bits of `MARKS`; number (T,) u32 and callsign: how
     an operator has named it (0, None: not).
@@ -202,6 +205,8 @@ class GlobalTracks(Header):
     weights: Floats | None = None
     ended: tuple[tuple[int, str, int | None], ...] = ()
     split_from: tuple[tuple[int, int], ...] = ()
+    rules: tuple[str, ...] | None = None
+    track_rule: U8 | None = None
     identity: tuple[str | None, ...] | None = None
     identity_p: Floats | None = None
     kind: tuple[str | None, ...] | None = None

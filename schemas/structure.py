@@ -119,6 +119,9 @@ def _global(values: Values) -> None:
     _unique(ids)
     _lengths(values, tracks, "status", "existence", "updated", "contributor_counts")
     _lengths(values, tracks, "identity", "identity_p", "kind", "kind_p", "track_origin", "marks", "number", "callsign")
+    _lengths(values, tracks, "track_rule")
+    if values["track_rule"] is not None and tracks and values["track_rule"].max() >= len(values["rules"] or ()):
+        raise MessageError("bad-field", "track_rule: beyond rules")
     contributions = int(values["contributor_counts"].sum(dtype=np.int64))
     parts = ("source", "epoch", "id", "influence")
     _lengths(values, contributions, *(f"contributor_{part}" for part in parts))

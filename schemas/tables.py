@@ -119,6 +119,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("initiation_delay", _SECONDS, float),
         _plain("may_start", values.boolean),
         _plain("correlation_group", values.text, optional=True),
+        _plain("feedback", values.boolean, optional=True),
     ),
     GlobalTracks: (
         *_HEADER,
@@ -138,6 +139,8 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _column("contributor_epoch", "<u8"),
         _column("contributor_id", "<u8"),
         _column("contributor_influence", "<f8"),
+        _plain("rules", _NAMES, list, optional=True),
+        _column("track_rule", "u1", optional=True),
         _plain("ended", _ENDED, values.pack_rows),
         _plain("split_from", _PAIRS, values.pack_rows),
         _plain("identity", _TEXTS, list, optional=True),

@@ -165,6 +165,7 @@ class TrackPublisher(_MessagePublisher):
         may_start: bool = True,
         position_covariance: ArrayLike | None = None,
         correlation_group: str | None = None,
+        feedback: bool | None = None,
     ) -> SensorInfo:
         """Say what this source is (fields: `schemas.SensorInfo`; m, s). Who joins later gets it as well; say it
         again whenever it changes."""
@@ -179,6 +180,7 @@ class TrackPublisher(_MessagePublisher):
             "may_start": may_start,
             "position_covariance": _maybe(_floats, "position_covariance", position_covariance, (3, 3)),
             "correlation_group": correlation_group,
+            "feedback": feedback,
         }
         return self._send(SensorInfo, local_key(self.source, "info", self.realm), 1, parts)
 

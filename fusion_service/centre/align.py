@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.arrays import Floats
 from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
+from fusion_service.centre.stated_registration import shift_of
 from fusion_service.densities import Mixtures
 from fusion_service.metrics import chi2_quantile
 from fusion_service.motion import predict
@@ -44,6 +46,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
             leave_out(source)
             continue
         predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9)
+        predicted = _shifted(predicted, shift_of(intake, source))
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
@@ -72,6 +75,15 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         fresh=tracks.updated > tracks.judged,
         kept=kept,
     )
+
+
+def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:
+    """Tracks that may all be off by one shift of this covariance (n, n), besides their own errors."""
+    if shift is None:
+        return tracks
+    more = shift[:, :, None]
+    parts = tracks.part_covariance + more[..., None]
+    return replace(tracks, covariance=tracks.covariance + more, part_covariance=parts)
 
 
 def _joined(parts: list[NDArray[Any]], kind: type[np.generic]) -> NDArray[Any]:

@@ -147,7 +147,8 @@ class Centre(ABC):
         )
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
-        status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), self._era.notes(time))
+        notes = self._era.notes(time)
+        status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), notes, self._watched())
         return StepResult(tracks, log, status)
 
     def refusals(self) -> dict[str, int]:
@@ -204,6 +205,10 @@ class Centre(ABC):
     @abstractmethod
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         """Bring the picture to `time`, ns, with these rows; names: all sources, sorted. Who fed each track."""
+
+    def _watched(self) -> dict[str, dict[str, Any]]:
+        """What the status says of sources, by name, beside what every kind of centre says."""
+        return {}
 
     @abstractmethod
     def _forget(self, tracks: Iterable[int]) -> None:

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
+from fusion_service.arrays import from_bytes, to_bytes
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Remembered
 from fusion_service.centre.lifecycle import Picture, empty_picture
@@ -34,15 +34,16 @@ READABLE = (1, 2)
 MISSING: dict[str, float] = {
     **dict.fromkeys(("since", "used", "judged", "weighed", "seen", "told", "last_hit", "due"), -1),
     "identity": -1,
+    "motion": -1,
     "kind": -1,
     "kind_p": np.nan,
 }
 """What columns hold that may not be in a checkpoint of an earlier release; others hold 0."""
 _PLAIN = (
     *("epoch", "alive", "muted", "last", "complete", "offset", "messages", "repeats", "gaps", "reordered"),
-    *("origin", "waited", "highest", "first", "interval", "why", "unused"),
+    *("origin", "waited", "highest", "first", "interval", "why", "unused", "lag"),
 )
-_LATER = ("interval", "why", "unused")
+_LATER = ("interval", "why", "unused", "lag")
 """What a checkpoint of an earlier release does not hold."""
 NO_ERA = (0, -1, -1, 0, -1, -1)
 Columns = TypeVar("Columns", Tracks, Picture)
@@ -116,7 +117,7 @@ def _pack_source(source: Source) -> dict[str, Any]:
     packed["seen"] = [list(key) for key in source.seen]
     packed["info"] = None if source.info is None else encode(source.info)
     packed["tracks"] = _pack_columns(source.tracks)
-    packed["remembered"] = [_bytes(column) for column in source.remembered]
+    packed["remembered"] = [to_bytes(column) for column in source.remembered]
     if source.vote is not None:
         packed["vote"] = [_pack_frame(source.vote.frame), list(source.vote.space), source.vote.time]
     return packed
@@ -130,7 +131,7 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
             setattr(source, plain, packed[plain])
     if "remembered" in packed:
         kinds = NOTHING_REMEMBERED
-        columns = (_array(one, like) for one, like in zip(packed["remembered"], kinds, strict=True))
+        columns = (from_bytes(one, like) for one, like in zip(packed["remembered"], kinds, strict=True))
         source.remembered = Remembered(*columns)
     if "vote" in packed:
         spoken, names, time = packed["vote"]
@@ -148,16 +149,8 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
 def _pack_columns(columns: Tracks | Picture) -> dict[str, Any]:
     packed: dict[str, Any] = {"components": len(columns.log_weight)}
     for one in fields(columns):
-        packed[one.name] = _bytes(getattr(columns, one.name))
+        packed[one.name] = to_bytes(getattr(columns, one.name))
     return packed
-
-
-def _bytes(array: NDArray[Any]) -> bytes:
-    return np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
-
-
-def _array(packed: bytes, like: NDArray[Any]) -> NDArray[Any]:
-    return np.frombuffer(packed, dtype=like.dtype.newbyteorder("<")).astype(like.dtype)
 
 
 def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
@@ -167,7 +160,7 @@ def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
     for one in fields(like):
         empty = getattr(like, one.name)
         blank = np.full(count, MISSING.get(one.name, 0)).astype(empty.dtype)
-        flat = blank if one.name not in packed else _array(packed[one.name], empty)
+        flat = blank if one.name not in packed else from_bytes(packed[one.name], empty)
         arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)
 

@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 
 from fusion_service.centre.intervals import Pace
-from fusion_service.centre.sources import Tracks
+from fusion_service.centre.sources import Source, Tracks
 from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.densities import Mixtures
-from schemas import SensorInfo
+from schemas import Motion, SensorInfo
 
-__all__ = ["declared_by", "loosened", "pace_of", "sensor_of"]
+__all__ = ["declared_by", "loosened", "motion_declared", "pace_of", "sensor_of"]
 
 PLACES = ("x", "y", "z")
 UNHEARD = 10.0
@@ -31,8 +31,16 @@ def declared_by(said: SourceConfig, info: SensorInfo | None) -> SourceConfig:
             other.detection_probability if own.detection_probability is None else own.detection_probability
         ),
         initiation_delay=own.initiation_delay or other.initiation_delay or 0.0,
+        feedback=said.feedback or bool(info.feedback),
     )
     return said if said.override else replace(said, period=info.period, motion=info.motion, may_start=info.may_start)
+
+
+def motion_declared(said: SourceConfig, source: Source, config: CentreConfig) -> Motion | None:
+    """How tracks of the source move, if it or the config says so; `said`: what holds for it."""
+    usual = SourceConfig().motion
+    known = source.info is not None or (source.name in config.sources and config.sources[source.name].override)
+    return said.motion if known or said.motion != usual else None
 
 
 def sensor_of(said: SourceConfig, info: SensorInfo | None) -> SensorInfo | None:

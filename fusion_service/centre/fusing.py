@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
@@ -35,17 +35,20 @@ MOST_PRODUCTS = 4096
 twelve sources moments are fused."""
 
 
-def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, journal: Journal) -> tuple[Picture, Floats]:
+def fuse_all(
+    rows: Rows, picture: Picture, time: int, config: CentreConfig, journal: Journal, left: Bools | None = None
+) -> tuple[Picture, Floats]:
     """The picture after fusion, and the influence (M,) of each row: trace(K)/n of its gain, 0 where it brought
     nothing new, NaN where it has no link.
 
     picture: predicted to `time`, ns. Of a mixture fused as such the influence is that of its moments; with
-    recursive memory it is the product of the shares in the two stages.
+    recursive memory it is the product of the shares in the two stages. left (M,): rows that are not to be fused here.
     """
     tracks = rows.tracks
     linked = (tracks.link != NO_TRACK) & ~tracks.outside
     influence = np.where(tracks.link != NO_TRACK, 0.0, np.nan)
-    used = linked if config.memory == "restart" else linked & (tracks.time > tracks.used)
+    linked = linked if left is None else linked & ~left
+    used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
     chosen = np.flatnonzero(used)
     mean, covariance = picture.mean.copy(), picture.covariance.copy()
     state_time = np.where(picture.time >= 0, time, -1)

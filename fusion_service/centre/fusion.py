@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre.align import predict_tracks, write_back
+from fusion_service.centre.align import write_back
 from fusion_service.centre.centre import Centre
 from fusion_service.centre.existence import Entries, update_existence
-from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.lifecycle import Picture, Support
 from fusion_service.centre.linking import Linker
 from fusion_service.centre.meeting import Meeting
+from fusion_service.centre.memory import Memory
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import relinked
@@ -39,26 +39,33 @@ class FusionCentre(Centre):
     def _begin(self) -> None:
         self._linker = Linker(self.config, self._ids)
         self._entries = Entries()
+        self._memory = Memory(self._intake)
         self._last = -1
 
     def _kept(self) -> dict[str, Any]:
-        return {**self._linker.packed(), "entries": self._entries.packed()}
+        return {**self._linker.packed(), "entries": self._entries.packed(), "memory": self._memory.packed()}
 
     def _restore(self, state: dict[str, Any]) -> None:
         self._linker.restore(state)
         self._entries = Entries.unpacked(state["entries"])
+        if "memory" in state:
+            self._memory.restore(state["memory"])
         self._last = self._time
 
     def _rebase(self, time: int) -> None:
         self._linker.merges.rebase(time)
+        self._memory.rebase(time)
         self._last = min(self._last, time)
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         now = self._associate(rows, names, time)
-        self._picture, influence = fuse_all(rows, now, time, self.config, self._journal)
+        self._picture, influence = self._memory.fuse(rows, names, self._picture, now, self._step, time, self._journal)
         self._live(rows, time)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
+
+    def _watched(self) -> dict[str, dict[str, Any]]:
+        return {name: self._memory.watch.health(name) for name in self._memory.watch.records}
 
     def _forget(self, tracks: Iterable[int]) -> None:
         self._relink(dict.fromkeys(tracks, 0))
@@ -77,7 +84,7 @@ class FusionCentre(Centre):
 
     def _associate(self, rows: Rows, names: tuple[str, ...], time: int) -> Picture:
         """Decide the links of the step; the picture that comes of it, predicted to `time`."""
-        now = self._predicted(time)
+        now = self._memory.motions.predicted(self._picture, time)
         count = len(now.id)
         meeting = Meeting(self._intake, self._labels, rows, now.id, names)
         self._picture, merged = self._linker.link(rows, self._picture, now, meeting, self._step, time, self._journal)
@@ -87,11 +94,6 @@ class FusionCentre(Centre):
             self._picture, now = self._picture.take(~gone), now.take(~gone[:count])
             count = len(now.id)
         return now.join(self._picture.take(slice(count, None)))
-
-    def _predicted(self, time: int) -> Picture:
-        picture, config = self._picture, self.config
-        dt = np.where(picture.time >= 0, time - picture.time, 0) / 1e9
-        return predict_tracks(picture, config.motion, config.space, config.space, dt)
 
     def _live(self, rows: Rows, time: int) -> None:
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from fusion_service.centre import notes
 from fusion_service.centre.clock import horizon
-from fusion_service.centre.declared import declared_by, loosened, pace_of, sensor_of
+from fusion_service.centre.declared import declared_by, loosened, motion_declared, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
 from fusion_service.centre.intervals import Pace, silence
@@ -39,6 +39,7 @@ from schemas import (
     LocalTracks,
     Message,
     MessageError,
+    Motion,
     SensorInfo,
     check_name,
     check_numbers,
@@ -160,6 +161,10 @@ class Intake:
         """What holds for a source: its own word, else the config's; with `override` the other way round."""
         return declared_by(self.config.source(source.name), source.info)
 
+    def motion_said(self, source: Source) -> Motion | None:
+        """How its tracks move, if anybody says so."""
+        return motion_declared(self.declared(source), source, self.config)
+
     def sensor(self, source: Source) -> SensorInfo | None:
         """Its info with coverage, detection probability and initiation delay as declared; None while it has none."""
         return sensor_of(self.declared(source), source.info)
@@ -207,7 +212,7 @@ class Intake:
         self._dead = None
         for source in self.sources.values():
             source.waited += len(source.tracks.id) > 0 and source.info is None
-            source.scans, source.ahead, source.arrived = 0, -1, []
+            source.scans, source.ahead, source.arrived, source.pairs = 0, -1, [], []
         for name, found in sorted(self._present.items()):
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):
@@ -296,7 +301,7 @@ class Intake:
                 if source.info is None or seq > source.info.seq:
                     source.info = message
             elif isinstance(message, Scan):
-                source.offset = received - message.time
+                source.heard(received, message.time, last)
                 tracks.append((source, message, entry))
         self._apply(tracks, time, journal)
 
@@ -382,7 +387,8 @@ class Intake:
             else:
                 room = MAX_TOTAL - sum(len(other.tracks.id) for other in self.sources.values() if other is not source)
                 pace = self.pace(source, first.complete)
-                reason = "" if source.apply(messages, new, min(room, MAX_TRACKS), pace) else "too-many-tracks"
+                most, follow = min(room, MAX_TRACKS), self.config.follows
+                reason = "" if source.apply(messages, new, most, pace, follow) else "too-many-tracks"
             if reason:
                 for (_, message, entry), _ in batch:
                     journal.refuse(replace(entry, reason=reason, count=len(message.ids)))

@@ -25,6 +25,7 @@ from fusion_service.centre.cells import Components, Stated, cells_and_reach, fus
 from fusion_service.centre.centre import Centre
 from fusion_service.centre.following import HOLD, Memory, assign, carried, live, next_number, ranked
 from fusion_service.centre.lifecycle import Picture, newborn
+from fusion_service.centre.motions import USUAL
 from fusion_service.centre.publishing import Contributions
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.stated_registration import stated_registration
@@ -236,7 +237,7 @@ class IntensityCentre(Centre):
         """Bring the picture to `time` with the states as its tracks; share (N, G) of each source in each track."""
         fused, picture, config = self._fused, self._picture, self.config
         dt = np.where(picture.time >= 0, time - picture.time, 0) / 1e9
-        mean, covariance = predict(config.motion, config.space, picture.mean, picture.covariance, dt)
+        mean, covariance = predict(config.motion or USUAL, config.space, picture.mean, picture.covariance, dt)
         picture = replace(picture, mean=mean, covariance=covariance)
         memory = self._memory.of(picture.id, time)
         place, number, lean, nearby = self._states(memory, picture, new)

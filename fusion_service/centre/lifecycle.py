@@ -22,7 +22,10 @@ from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
-__all__ = ["Picture", "Support", "advance", "empty_picture", "newborn"]
+__all__ = ["WAYS", "Picture", "Support", "advance", "empty_picture", "newborn"]
+
+WAYS = ("", "tracklet", "bar-shalom-campo derived", "bci derived", "bci declared", "ci")
+"""What a track may be fused by: "" is the rule of the config."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -33,7 +36,8 @@ class Picture:
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
     overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
-    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of.
+    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; motion i32 code (see `motions`);
+    way u8 index into `WAYS` of what it was last fused by.
     """
 
     id: NDArray[np.uint64]
@@ -54,6 +58,8 @@ class Picture:
     existence: NDArray[np.float64]
     opinion: NDArray[np.float64]
     evidence: NDArray[np.float64]
+    motion: NDArray[np.int32]
+    way: NDArray[np.uint8]
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
@@ -101,6 +107,8 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
         existence=np.ones(count),
         opinion=np.full(count, np.nan),
         evidence=np.zeros(count),
+        motion=np.full(count, -1, dtype=np.int32),
+        way=np.zeros(count, dtype=np.uint8),
     )
 
 

@@ -40,6 +40,10 @@ class Rows:
         """Rows that belong to a global track."""
         return np.flatnonzero(self.tracks.link != NO_TRACK)
 
+    def inside_mask(self) -> NDArray[np.bool_]:
+        """`inside` as a mask (M,)."""
+        return np.asarray((self.tracks.link != NO_TRACK) & ~self.tracks.outside)
+
     def inside(self) -> NDArray[np.intp]:
         """Rows that belong to a global track and are fused in it: their newest datum has passed its gate."""
-        return np.flatnonzero((self.tracks.link != NO_TRACK) & ~self.tracks.outside)
+        return np.flatnonzero(self.inside_mask())

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ __all__ = [
     "LINKS",
     "REMEMBERED",
     "Columns",
+    "Pair",
     "Source",
     "Tracks",
     "as_mixtures",
@@ -131,6 +132,10 @@ OF_THE_TRACK = ("judged", "seen", "told")
 """Those of them that a new link leaves as they are: what was done with the newest datum."""
 
 
+Pair: TypeAlias = tuple[Tracks, Tracks]
+"""Old versions of some tracks, and the new ones that came next."""
+
+
 def empty_tracks(n: int) -> Tracks:
     """No tracks, of n components."""
     whole, real, code = np.zeros(0, dtype=np.int64), np.zeros(0), np.zeros(0, dtype=np.int32)
@@ -231,13 +236,30 @@ def newest(old: Tracks, new: Tracks) -> Tracks:
     return both.take(order[last])
 
 
+def successive(old: Tracks, new: Tracks) -> Pair | None:
+    """Each version of `new` with the one before it, in `old` (sorted by id) or in `new`; without those that hold no
+    newer measurement than it, or of which a later one was there already. None if there is no such version."""
+    if not len(old.id) or not len(new.id):
+        return None
+    both = join_tracks([old.take(np.isin(old.id, new.id)), new])
+    order = np.lexsort((np.arange(len(both.id)), both.time, both.id))
+    both, fresh = both.take(order), order >= len(both.id) - len(new.id)
+    first, last = both.take(slice(None, -1)), both.take(slice(1, None))
+    begun = np.maximum.accumulate(np.where(fresh, -1, np.arange(len(fresh))))[:-1]
+    same = (first.id == last.id) & (begun >= 0) & (both.id[begun] == first.id) & fresh[1:]
+    same &= (last.updated > first.updated) & (first.origin == last.origin)
+    return (first.take(same), last.take(same)) if same.any() else None
+
+
 @dataclass(slots=True)
 class Source:
     """State of one source. Times are ns; -1 means never.
 
     interval: between its scans, ns, measured (-1: not yet). remembered: its tracks that went stale. vote: the frame it
-    speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason. Of
-    the step being made: arrived, the ids that came; ahead, the time of the newest message that is for a later one.
+    speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason.
+    lag: how far behind the last step its messages come, ns, about the longest of late. Of the step being made:
+    arrived, the ids that came; pairs, their versions, where those are followed; ahead, the time of the newest message
+    that is for a later one.
     """
 
     name: str
@@ -264,6 +286,8 @@ class Source:
     unused: dict[str, int] = field(default_factory=dict)
     arrived: list[NDArray[np.uint64]] = field(default_factory=list)
     ahead: int = -1
+    lag: int = 0
+    pairs: list[Pair] = field(default_factory=list)
     highest: dict[str, int] = field(default_factory=dict)
     first: dict[str, int] = field(default_factory=dict)
     seen: deque[tuple[str, int, int]] = field(default_factory=deque)
@@ -274,6 +298,7 @@ class Source:
         self.epoch, self.info, self.waited, self.last, self.complete = epoch, None, 0, -1, -1
         self.tracks = empty_tracks(len(self.space))
         self.interval, self.remembered, self.why, self.arrived = -1, NOTHING_REMEMBERED, "", []
+        self.lag, self.pairs = 0, []
         self.highest, self.first, self.seen, self.seen_set = {}, {}, deque(), set()
 
     def leave(self, reason: str, count: int) -> None:
@@ -303,14 +328,21 @@ class Source:
         if len(self.seen) > REMEMBERED:
             self.seen_set.discard(self.seen.popleft())
 
-    def apply(self, messages: Sequence[LocalTracks], new: Tracks, most: int, pace: Pace) -> bool:
+    def heard(self, received: int, time: int, last: int) -> None:
+        """Tracks of `time` came at `received`, after the step at `last` (-1: none), ns."""
+        late = max(last - time, 0) if last >= 0 else 0
+        self.offset, self.lag = received - time, max(late, self.lag - (self.lag - late) // 8)
+
+    def apply(
+        self, messages: Sequence[LocalTracks], new: Tracks, most: int, pace: Pace, versions: bool = False
+    ) -> bool:
         """Take the tracks of a complete scan, or of partial ones in a row; what a complete scan does not list is
-        gone. False, and nothing is changed, if there would be more than `most` tracks."""
+        gone. versions: keep them. False, and nothing is changed, if there would be more than `most` tracks."""
         space, complete = messages[-1].space, messages[-1].complete
         new = new.take(new.time >= self.complete)
         old = self.tracks if space == self.space else empty_tracks(len(space))
         new = replace(new, interval=intervals(new.id, new.time, self._known(old), pace))
-        merged = newest(old, new)
+        merged, pair = newest(old, new), successive(old, new) if versions else None
         end = messages[-1].time
         if complete and end >= self.complete:
             listed = np.isin(merged.id, messages[-1].ids)
@@ -321,6 +353,8 @@ class Source:
             self.scans += end >= self.complete
             self.complete = max(self.complete, end)
         self.arrived.append(new.id)
+        if pair is not None:
+            self.pairs.append(pair)
         for message in messages:
             if 0 <= self.last < message.time:
                 gap = message.time - self.last

@@ -15,7 +15,7 @@ from fusion_service.centre.sources import Source
 from fusion_service.geodesy import FrameError, transform
 from schemas import Frame
 
-__all__ = ["stated_registration"]
+__all__ = ["shift_of", "stated_registration"]
 
 
 AXES = ("x", "y", "z")
@@ -26,17 +26,23 @@ LARGEST = 1e5
 def stated_registration(intake: Intake, names: tuple[str, ...]) -> Floats | None:
     """Covariances (n, n, N), m2, in the picture's space and frame, of the shifts of the N sources named; None if
     nobody states one, or the frame is not known yet."""
+    shifts = [shift_of(intake, intake.sources[name]) for name in names]
+    if all(shift is None for shift in shifts):
+        return None
+    n = len(intake.config.space)
+    return np.stack([np.zeros((n, n)) if shift is None else shift for shift in shifts], axis=-1)
+
+
+def shift_of(intake: Intake, source: Source) -> Floats | None:
+    """Covariance (n, n), m2, in the picture's space and frame, of the shift that a source states; None if none."""
     frame, space = intake.frame, intake.config.space
-    if frame is None:
+    shift = np.zeros((3, 3)) if frame is None else _shift(intake, source, frame)
+    if not shift.any():
         return None
-    shifts = [_shift(intake, intake.sources[name], frame) for name in names]
-    if not any(shift.any() for shift in shifts):
-        return None
-    out = np.zeros((len(space), len(space), len(names)))
-    at = [(space.index(axis), AXES.index(axis)) for axis in AXES if axis in space]
-    for row, a in at:
-        for column, b in at:
-            out[row, column] = [shift[a, b] for shift in shifts]
+    out = np.zeros((len(space), len(space)))
+    there = [axis for axis in AXES if axis in space]
+    to, of = ([names.index(axis) for axis in there] for names in (space, AXES))
+    out[np.ix_(to, to)] = shift[np.ix_(of, of)]
     return out
 
 

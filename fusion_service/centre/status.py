@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 from fusion_service.centre.intake import Intake
@@ -19,8 +20,10 @@ def step_status(
     tracks: dict[str, int],
     refused: dict[str, int],
     notes: tuple[str, ...] | None = None,
+    more: Mapping[str, dict[str, Any]] | None = None,
 ) -> Status:
-    """Status after the step of `log`; tracks: how many there are of each kind; notes: what an operator should know."""
+    """Status after the step of `log`; tracks: how many there are of each kind; notes: what an operator should know;
+    more: what else there is to say of a source, by its name."""
     return Status(
         source=log.source,
         epoch=log.epoch,
@@ -33,7 +36,10 @@ def step_status(
         queue={"pending": intake.pending()},
         refused=refused,
         dropped=dict(sorted(journal.dropped.items())),
-        sources={name: _health(source, intake, journal, log.time) for name, source in sorted(intake.sources.items())},
+        sources={
+            name: _health(source, intake, journal, log.time) | dict((more or {}).get(name, {}))
+            for name, source in sorted(intake.sources.items())
+        },
         tracks=tracks,
         step_time={},
         notes=notes,

@@ -91,6 +91,7 @@ class SourceConfig:
         0.0, number(0.0, 1e5), "kind = intensity: m, error common to all it reports; SensorInfo: position_covariance"
     )
     inflation: float = _setting(1.0, number(0, 1e6, above=True), "factor on its covariances")
+    feedback: bool = _setting(False, flag, "its tracker is fed with fused tracks: no tracklets of it")
     override: bool = _setting(False, flag, "use these values even where its SensorInfo says otherwise")
     ignore: bool = _setting(False, flag, "refuse all it sends (reason: muted)")
     allowed_origins: tuple[str, ...] = _setting(ORIGINS, origins, "origins taken from it; others are refused")
@@ -124,11 +125,17 @@ class CentreConfig:
     publish_region: Coverage | None = _setting(
         None, maybe(read_coverage), "only tracks in it go out; about the origin of the picture's frame; left out: all"
     )
-    memory: str = _setting("restart", choice("restart", "recursive"), "fuse local tracks only, or the last result too")
+    memory: str = _setting(
+        "restart",
+        choice("restart", "recursive", "tracklet"),
+        "fuse local tracks only, the last result too, or what successive versions of them have added",
+    )
     memory_correlation: float = _setting(
         1.0, number(0, 1), "bound on the correlation of the last result and new tracks"
     )
-    motion: Motion = _setting(Motion("cv", 1.0), lambda v: build(Motion, v), "motion of a global track on its own")
+    motion: Motion | None = _setting(
+        None, maybe(lambda v: build(Motion, v)), "motion of a global track on its own; left out: as its sources declare"
+    )
     gate: float = _setting(0.999, number(0.5, 1 - 1e-9), "probability inside the gate for a new link")
     keep_gate: float = _setting(0.9999, number(0.5, 1 - 1e-12), "probability inside the gate for a standing link")
     merge_gate: float = _setting(0.999, number(0.5, 1 - 1e-9), "two global tracks further apart are not the same")
@@ -175,6 +182,11 @@ class CentreConfig:
     fuse_origins: bool = _setting(False, flag, "fuse live, exercise, simulated and replayed data together")
     source_defaults: SourceConfig = _setting(SourceConfig(), lambda v: v, "for every source")
     sources: dict[str, SourceConfig] = _setting({}, table, "by name, over the defaults")
+
+    @property
+    def follows(self) -> bool:
+        """Whether successive versions of local tracks are used, not only the newest."""
+        return self.memory == "tracklet"
 
     def source(self, name: str) -> SourceConfig:
         """The settings of one source: its own, or the defaults."""

@@ -1,0 +1,184 @@
+"""What a centre remembers of its targets beside the picture, and which rows take part in it in which way.
+
+With `memory = "tracklet"` a global track that a capable row feeds goes by the filter of the target (`tracklets`); every
+other one by the rule of the config, from the rows of the step alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.centre.fusing import fuse_all
+from fusion_service.centre.increments import Increments, increments
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.motions import Motions, States
+from fusion_service.centre.rows import Rows
+from fusion_service.centre.tracklets import Filters, Operations, run
+from fusion_service.centre.versions import Versions, versions_of
+from fusion_service.centre.watch import Watch
+
+__all__ = ["Memory"]
+
+
+class Memory:
+    """The filters of targets, the motions they go by, and the watch over the sources that feed them."""
+
+    def __init__(self, intake: Intake) -> None:
+        self._intake = intake
+        self._config = intake.config
+        self.motions = Motions(intake.config)
+        self.filters = Filters.none(len(intake.config.space))
+        self.watch = Watch()
+
+    def fuse(
+        self, rows: Rows, names: tuple[str, ...], before: Picture, now: Picture, step: int, time: int, journal: Journal
+    ) -> tuple[Picture, Floats]:
+        """The picture of the step at `time`, ns, and the influence (M,) of each row, as `fusing.fuse_all`. before:
+        the picture after the last step, `now` the same predicted to `time`."""
+        if self._config.memory != "tracklet":
+            picture, influence = fuse_all(rows, now, time, self._config, journal)
+            return self._moving(rows, names, picture), influence
+        for event in self.watch.begin(self._intake, names):
+            journal.event(event)
+        at = np.where(rows.inside_mask(), now.find(rows.tracks.link), -1)
+        capable = self._capable(rows, names)
+        filtered = np.zeros(len(now.id) + 1, dtype=np.bool_)
+        filtered[at[capable & (at >= 0)]] = True
+        filtered[-1] = False
+        filtered[:-1] &= before.time >= 0
+        picture, influence = fuse_all(rows, now, time, self._config, journal, filtered[at])
+        ruled = np.zeros(len(now.id) + 1, dtype=np.bool_)
+        ruled[at[~filtered[at]]] = True
+        picture = self._filter(rows, names, before, picture, influence, at, capable, filtered, ruled[:-1], step, time)
+        return self._moving(rows, names, picture), influence
+
+    def _moving(self, rows: Rows, names: tuple[str, ...], picture: Picture) -> Picture:
+        """The picture, its tracks moving as the sources that feed them declare."""
+        inside = rows.inside()
+        sources = (self._intake.sources[name] for name in names)
+        declared = [self._intake.motion_said(source) for source in sources]
+        at = picture.find(rows.tracks.link[inside])
+        return replace(picture, motion=self.motions.follow(picture, at, declared, rows.source[inside]))
+
+    def _capable(self, rows: Rows, names: tuple[str, ...]) -> Bools:
+        """Rows (M,) whose versions may be taken as tracklets."""
+        sources = np.array([not self.watch.records[name].reason for name in names], dtype=np.bool_)
+        parts = rows.tracks.log_weight
+        several = np.isfinite(parts).sum(axis=0) > 1 if len(parts) else np.zeros(len(rows.source), dtype=np.bool_)
+        return sources[rows.source] & ~several
+
+    def _filter(
+        self, rows: Rows, names: tuple[str, ...], before: Picture, picture: Picture, influence: Floats, at: Ints,
+        capable: Bools, filtered: Bools, ruled: Bools, step: int, time: int,
+    ) -> Picture:  # fmt: skip
+        """Run the filters of the tracks `filtered`, and write the influences of their rows."""
+        tracks, config = rows.tracks, self._config
+        self.filters.rename(names)
+        base = self.filters.bases(before)
+        versions = versions_of(self._intake, rows)
+        found = increments(versions)
+        settled = filtered[at] & (tracks.since < step)
+        row = versions.row
+        good = found.sound & (capable & settled)[row] & (versions.time >= base.time[at[row]])
+        spoiled = np.zeros(len(at), dtype=np.bool_)
+        spoiled[row[~good]] = True
+        good &= ~spoiled[row]
+        whole = filtered[at] & (tracks.time > tracks.used) & (spoiled | ~capable | ~settled)
+        self._note(rows, names, row, found, good)
+        new = self._as_operations(rows, names, versions, found, np.flatnonzero(good))
+        kept = np.isin(self.filters.pending.track, picture.id[filtered[:-1]])
+        operations = self.filters.pending.take(kept).join(new, _whole(rows, np.flatnonzero(whole), time))
+        some = np.flatnonzero(filtered[:-1])
+        cut = self._cut(rows, names, at, len(picture.id), time)[some]
+        which = np.searchsorted(picture.id[some], operations.track)
+        states, bases, share = run(base.take(some), which, operations, cut, time, self.motions, config)
+        fresh = operations.row >= 0
+        np.add.at(influence, operations.row[fresh], share[fresh])
+        tracks.used[filtered[at]] = tracks.time[filtered[at]]
+        open_ = operations.take(operations.time > cut[which])
+        self._keep(picture, bases, some, open_, ruled)
+        mean, covariance, when = picture.mean.copy(), picture.covariance.copy(), picture.time.copy()
+        mean[:, some], covariance[:, :, some], when[some] = states.mean, states.covariance, time
+        way = np.where(filtered[:-1], 1, np.where(ruled, 0, picture.way)).astype(np.uint8)
+        return replace(picture, mean=mean, covariance=covariance, time=when, way=way)
+
+    def _note(self, rows: Rows, names: tuple[str, ...], row: Ints, found: Increments, taken: Bools) -> None:
+        """Let the watch see the versions that count: of sources that declare what it takes, and Gaussian."""
+        watched = [self.watch.records[name].reason in ("", "innovations") for name in names]
+        mine = np.array(watched, dtype=np.bool_)[rows.source[row]]
+        parts = rows.tracks.log_weight
+        if len(parts):
+            mine &= np.isfinite(parts[:, row]).sum(axis=0) <= 1
+        self.watch.add(names, rows.source[row][mine], found.take(mine), taken[mine])
+
+    def _as_operations(
+        self, rows: Rows, names: tuple[str, ...], versions: Versions, found: Increments, some: Ints
+    ) -> Operations:
+        inflation = np.array([self._inflation(name) for name in names])
+        row = versions.row[some]
+        scale = 1.0 / inflation[rows.source[row]]
+        return Operations(
+            rows.tracks.link[row], versions.time[some], rows.source[row].astype(np.int64), rows.tracks.id[row],
+            np.zeros(len(some), dtype=np.bool_), versions.predicted_mean[:, some], found.vector[:, some] * scale,
+            found.information[:, :, some] * scale, row,
+        )  # fmt: skip
+
+    def _inflation(self, name: str) -> float:
+        said = self._intake.declared(self._intake.sources[name])
+        return said.inflation * self.watch.records[name].inflation
+
+    def _cut(self, rows: Rows, names: tuple[str, ...], at: Ints, count: int, time: int) -> NDArray[np.int64]:
+        """Up to when (G,) all is in that the sources of each track will send."""
+        lag = np.array([self._intake.sources[name].lag for name in names], dtype=np.int64)
+        late = np.zeros(count, dtype=np.int64)
+        fed = at >= 0
+        np.maximum.at(late, at[fed], lag[rows.source[fed]])
+        return time - np.minimum(late, round(self._config.lateness * 1e9))
+
+    def _keep(self, picture: Picture, bases: States, some: Ints, pending: Operations, ruled: Bools) -> None:
+        """The filters of the next step: those that ran, and those that nothing was said of."""
+        held = self.filters
+        quiet = np.isin(held.id, picture.id[~ruled]) & ~np.isin(held.id, picture.id[some])
+        ids = np.concatenate([picture.id[some], held.id[quiet]])
+        order = np.argsort(ids, kind="stable")
+        one, other = bases, held.base.take(quiet)
+        base = States.of(
+            np.concatenate([one.time, other.time])[order],
+            np.concatenate([one.mean, other.mean], axis=-1)[..., order],
+            np.concatenate([one.covariance, other.covariance], axis=-1)[..., order],
+            np.concatenate([one.motion, other.motion])[order],
+        )
+        rest = held.pending.take(np.isin(held.pending.track, held.id[quiet]))
+        pending = replace(pending, row=np.full_like(pending.row, -1))
+        self.filters = Filters(held.names, ids[order], base, pending.join(rest))
+
+    def rebase(self, time: int) -> None:
+        """A new era begins at `time`, ns."""
+        self.filters.rebase(time)
+
+    def packed(self) -> dict[str, Any]:
+        """As plain values."""
+        return {"motions": self.motions.packed(), "watch": self.watch.packed(), "filters": self.filters.packed()}
+
+    def restore(self, packed: dict[str, Any]) -> None:
+        """From what `packed` gave; without the filters where the state space is another."""
+        self.motions.restore(packed["motions"])
+        self.watch.restore(packed["watch"])
+        self.filters = Filters.unpacked(packed["filters"], len(self._config.space))
+
+
+def _whole(rows: Rows, some: Ints, time: int) -> Operations:
+    """The rows `some` as whole estimates at the step."""
+    tracks, count = rows.tracks, len(some)
+    mean = tracks.mean[:, some]
+    return Operations(
+        tracks.link[some], np.full(count, time, dtype=np.int64), rows.source[some].astype(np.int64), tracks.id[some],
+        np.ones(count, dtype=np.bool_), mean, np.zeros_like(mean), tracks.covariance[:, :, some], some,
+    )  # fmt: skip

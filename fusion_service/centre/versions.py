@@ -1,0 +1,94 @@
+"""The versions that local tracks have gone through since the last step, each beside the one before it.
+
+What a local tracker has learnt between two versions of a track is told by what changed: the old version, predicted
+with the source's declared motion to the time of the new one, beside the new one. `tracklets` and `derived` are made of
+nothing else. A version in which there is no newer measurement, or that comes after a later one, is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.arrays import Floats, Ints
+from fusion_service.centre.align import predict_tracks
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.rows import Rows
+from fusion_service.centre.sources import Pair, Tracks, join_tracks
+from schemas import Motion
+
+__all__ = ["Versions", "versions_of"]
+
+MOST_MOTIONS = 16
+"""Motions that one source may declare between two steps."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Versions:
+    """K new versions of rows, in order of (time, row). row (K,): index into the step's `Rows`; time, before (K,) ns of
+    the new and of the old one; predicted_mean (n, K) and predicted_covariance (n, n, K): the old one predicted to
+    `time`; mean, covariance: the new one; both in the centre's space and frame, as the source said them (neither
+    inflated nor with its registration error)."""
+
+    row: Ints
+    time: NDArray[np.int64]
+    before: NDArray[np.int64]
+    predicted_mean: Floats
+    predicted_covariance: Floats
+    mean: Floats
+    covariance: Floats
+
+    def take(self, at: Any) -> Versions:
+        """The given ones (indices or a mask)."""
+        return Versions(*(getattr(self, one.name)[..., at] for one in fields(self)))
+
+
+def versions_of(intake: Intake, rows: Rows) -> Versions:
+    """All versions that came in with this step, of rows that are used in it."""
+    n = len(intake.config.space)
+    parts = [part for name, part in _by_source(intake, rows) if len(part.row)]
+    if not parts:
+        none, whole = np.zeros((n, 0)), np.zeros(0, dtype=np.int64)
+        return Versions(np.zeros(0, dtype=np.intp), whole, whole, none, np.zeros((n, n, 0)), none, np.zeros((n, n, 0)))
+    joined = Versions(
+        *(np.concatenate([getattr(part, one.name) for part in parts], axis=-1) for one in fields(Versions))
+    )
+    return joined.take(np.lexsort((joined.row, joined.time)))
+
+
+def _by_source(intake: Intake, rows: Rows) -> Iterator[tuple[str, Versions]]:
+    start = 0
+    for name, count in rows.kept.items():
+        source, ids = intake.sources[name], rows.tracks.id[start : start + count]
+        if source.pairs and count:
+            said = intake.declared(source)
+            yield name, _versions(source.pairs, said.motion, said.inflation, source.space, intake, ids, start)
+        start += count
+
+
+def _versions(
+    pairs: list[Pair], motion: Motion, inflation: float, space: tuple[str, ...], intake: Intake, ids: Any, start: int
+) -> Versions:
+    """Those of one source, whose rows have these ids (sorted), the first of them being row `start`."""
+    old, new = (join_tracks([pair[side] for pair in pairs]) for side in (0, 1))
+    at = np.minimum(np.searchsorted(ids, new.id), len(ids) - 1)
+    known = ids[at] == new.id
+    old, new, at = _as_said(old.take(known), inflation), _as_said(new.take(known), inflation), at[known]
+    wanted = intake.config.space
+    predicted = predict_tracks(old, motion, space, wanted, (new.time - old.time) / 1e9)
+    now = predict_tracks(new, motion, space, wanted, np.zeros(len(new.time)))
+    return Versions(at + start, new.time, old.time, predicted.mean, predicted.covariance, now.mean, now.covariance)
+
+
+def _as_said(tracks: Tracks, inflation: float) -> Tracks:
+    """Covariances before they were inflated."""
+    if inflation == 1.0:
+        return tracks
+    columns = {one.name: getattr(tracks, one.name) for one in fields(tracks)}
+    columns["covariance"] = tracks.covariance / inflation
+    columns["part_covariance"] = tracks.part_covariance / inflation
+    return Tracks(**columns)

@@ -1,0 +1,139 @@
+"""Whose local tracks are taken as tracklets, and whether their increments are what their sources say.
+
+What a source declares decides first (`reasons`). Then its own innovations are watched: the normalised squares of those
+of all its tracks, summed over some thousands, are compared with their expectation. A source whose sum is beyond its
+bounds, and by more than matters, claims measurements better than they are, or a motion that is not that of its
+tracker: up to `WORST` times too large, its increments are divided by as much; beyond, or too small, its tracks go by
+the rule until the sum is within the bounds again.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fusion_service.arrays import Bools, Ints
+from fusion_service.centre.increments import Increments
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.sources import Source
+from fusion_service.centre.stated_registration import shift_of
+
+__all__ = ["Record", "Watch", "reason_of"]
+
+REMEMBERED = 2000.0
+"""Degrees of freedom that a sum holds about; older ones fade."""
+SIGMAS = 3.3
+"""Of a sum's own spread, beyond which it is not by chance (1 in 1,000, two-sided)."""
+MATTERS = 0.15
+"""Deviation from 1 that is left alone though it is no chance: trackers of real sensors are never exact."""
+WORST = 2.0
+LEAST = 0.6
+
+
+@dataclass(slots=True)
+class Record:
+    """Of one source, fading: sum and freedom of its innovations, versions and how many of them were tracklets.
+    reason: why its tracks are not taken as tracklets, or ""."""
+
+    sum: float = 0.0
+    freedom: float = 0.0
+    versions: float = 0.0
+    taken: float = 0.0
+    reason: str = ""
+
+    @property
+    def ratio(self) -> float:
+        """Mean normalised square of an innovation: 1 if the source is what it says; NaN where none is known."""
+        return self.sum / self.freedom if self.freedom > 0 else math.nan
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """What the ratio lies within by chance, or without mattering."""
+        spread = max(SIGMAS * math.sqrt(2.0 / max(self.freedom, 1e-9)), MATTERS)
+        return max(1.0 - spread, 0.0), 1.0 + spread
+
+    @property
+    def inflation(self) -> float:
+        """What its increments are to be divided by."""
+        return self.ratio if self.ratio > self.bounds[1] else 1.0
+
+    @property
+    def fails(self) -> bool:
+        """Whether its increments are not to be taken at all."""
+        low, high = self.bounds
+        return self.ratio > max(high, WORST) or self.ratio < min(low, LEAST)
+
+    def add(self, innovation: float, freedom: float, versions: int, taken: int) -> None:
+        """Count one step."""
+        kept = min(1.0, REMEMBERED / (self.freedom + freedom)) if freedom > 0 else 1.0
+        self.sum, self.freedom = kept * (self.sum + innovation), kept * (self.freedom + freedom)
+        kept = min(1.0, REMEMBERED / (self.versions + versions)) if versions > 0 else 1.0
+        self.versions, self.taken = kept * (self.versions + versions), kept * (self.taken + taken)
+
+
+class Watch:
+    """The records of all sources, by name."""
+
+    def __init__(self) -> None:
+        self.records: dict[str, Record] = {}
+
+    def begin(self, intake: Intake, names: tuple[str, ...]) -> list[dict[str, Any]]:
+        """Judge who is capable in a step, by what is declared and by the record; what has changed, as events."""
+        self.records = {name: self.records.get(name, Record()) for name in names}
+        changed = []
+        for name, record in self.records.items():
+            reason = reason_of(intake, intake.sources[name])
+            if not reason and record.fails:
+                reason = "innovations"
+            if reason != record.reason and (reason or record.versions):
+                changed.append({"kind": "tracklets", "source": name, "why": reason, "ratio": round(record.ratio, 4)})
+            record.reason = reason
+        return changed
+
+    def add(self, names: tuple[str, ...], source: Ints, found: Increments, taken: Bools) -> None:
+        """Count the versions of a step; source (K,): index into names; taken (K,): as tracklets."""
+        for at in np.unique(source).tolist():
+            mine = source == at
+            innovation, freedom = (math.fsum(part[mine].tolist()) for part in (found.innovation, found.freedom))
+            self.records[names[at]].add(innovation, freedom, int(mine.sum()), int(taken[mine].sum()))
+
+    def health(self, name: str) -> dict[str, Any]:
+        """What the status says of a source."""
+        record = self.records.get(name)
+        if record is None or (not record.versions and not record.reason):
+            return {}
+        low, high = record.bounds
+        said = {"tracklets": record.taken / record.versions if record.versions else 0.0, "no_tracklets": record.reason}
+        if record.freedom > 0:
+            said |= {"innovation": record.ratio, "innovation_low": low, "innovation_high": high}
+        return said
+
+    def packed(self) -> dict[str, list[Any]]:
+        """As plain values."""
+        return {
+            name: [one.sum, one.freedom, one.versions, one.taken, one.reason]
+            for name, one in sorted(self.records.items())
+        }
+
+    def restore(self, packed: dict[str, list[Any]]) -> None:
+        """From what `packed` gave."""
+        self.records = {str(name): Record(*values) for name, values in packed.items()}
+
+
+def reason_of(intake: Intake, source: Source) -> str:
+    """Why tracks of a source are not taken as tracklets by what is declared of it; "" where they may be."""
+    said = intake.declared(source)
+    if intake.motion_said(source) is None:
+        return "motion"
+    if said.feedback:
+        return "feedback"
+    if said.covariance_floor > 0.0:
+        return "covariance_floor"
+    if shift_of(intake, source) is not None:
+        return "registration"
+    if not set(source.space) <= set(intake.config.space):
+        return "space"
+    return ""
