@@ -30,7 +30,7 @@ SIGMAS = 3.3
 MATTERS = 0.15
 """Deviation from 1 that is left alone though it is no chance: trackers of real sensors are never exact."""
 WORST = 2.0
-LEAST = 0.6
+LEAST = 0.75
 
 
 @dataclass(slots=True)
