@@ -3,7 +3,7 @@
 On each axis the state holds some of position, velocity and acceleration. What drives a chain of L derivatives is
 white noise on the highest (cv, ca, still: Bar-Shalom, Li, Kirubarajan, Estimation with Applications, 2001, 6.2) or
 a highest derivative that is forgotten exponentially (Singer's acceleration, an Ornstein-Uhlenbeck velocity: ibid.,
-8.2). Coordinated turn (ct): the velocity turns at the state's turn_rate (ibid., 11.7), with the exact Jacobian.
+8.2). Coordinated turn (ct): the velocity turns at the state's turn_rate (`turn`).
 
 What a state does not have, it cannot carry from one step to the next, and yet it moves the target:
 
@@ -26,30 +26,35 @@ import numpy as np
 
 from fusion_service.arrays import Floats
 from fusion_service.linalg import congruence, matvec
-from schemas import Motion
+from fusion_service.turn import turn, turns
+from schemas import Frame, Motion
 
 __all__ = ["predict", "transition"]
 
 
 AXES = (("x", "vx", "ax"), ("y", "vy", "ay"), ("z", "vz", "az"))
-SMALL_TURN = 0.25
-"""Below this angle (rad) the derivatives by the turn rate come from their series."""
 SMALL_GAP = 1.0
 """Below this multiple of tau the moments of what is forgotten come from their series, of `TERMS` terms."""
 TERMS = 22
 
 
 def predict(
-    motion: Motion, space: tuple[str, ...], means: Floats, covariances: Floats, dt: Floats
+    motion: Motion,
+    space: tuple[str, ...],
+    means: Floats,
+    covariances: Floats,
+    dt: Floats,
+    frame: Frame | None = None,
 ) -> tuple[Floats, Floats]:
     """Means (n, B) and covariances (n, n, B) after `dt` (B,) seconds, one per element; 0 returns the same bits.
 
-    F x and F P F' + Q with F and Q of `transition`; under a turn the mean goes by the turn itself.
+    F x and F P F' + Q with F and Q of `transition`; under a turn the mean goes by the turn itself. frame: that of
+    the states, of which a turn asks where up is.
     Raises ValueError for a negative or NaN `dt`.
     """
-    moves, noise = transition(motion, space, means, dt)
+    moves, noise = transition(motion, space, means, dt, frame)
     with np.errstate(all="ignore"):
-        if _turns(motion, space):
+        if motion.kind == "ct" and turns(space, frame):
             w = space.index("turn_rate")
             straight = means.copy()
             straight[w] = 0.0
@@ -62,7 +67,9 @@ def predict(
     return np.where(same, means, predicted), np.where(same, covariances, spread)
 
 
-def transition(motion: Motion, space: tuple[str, ...], means: Floats, dt: Floats) -> tuple[Floats, Floats]:
+def transition(
+    motion: Motion, space: tuple[str, ...], means: Floats, dt: Floats, frame: Frame | None = None
+) -> tuple[Floats, Floats]:
     """F and Q (n, n, B) of `dt` (B,) seconds from states of `means` (n, B), any order of components.
 
     cv: position, velocity and acceleration, as far as the space has them, are integrated; q drives the highest one,
@@ -72,9 +79,8 @@ def transition(motion: Motion, space: tuple[str, ...], means: Floats, dt: Floats
     or acceleration becomes 0 with `sigma` as soon as dt > 0. Under ou an acceleration in the state is forgotten
     likewise, with sigma/tau, and moves nothing.
 
-    ct: F is the Jacobian at the means. In the horizontal plane x' = x + S vx - C vy, y' = y + C vx + S vy with
-    S = sin(w dt)/w, C = (1 - cos(w dt))/w; the noise on each axis is as in cv. A space without turn_rate, vx or vy,
-    or with ax or ay, has no coordinated turn: there ct acts as cv.
+    ct: F is the Jacobian at the means (see `turn`); the noise on each axis is as in cv. A space that has no turn in
+    this frame is predicted as cv.
 
     In every kind q_turn dt is added on a turn rate. Raises ValueError for a negative or NaN `dt`.
     """
@@ -82,13 +88,9 @@ def transition(motion: Motion, space: tuple[str, ...], means: Floats, dt: Floats
         raise ValueError("a state is never predicted back in time: dt must be 0 or more seconds")
     with np.errstate(all="ignore"):
         moves, noise = _kinematics(motion, space, np.ascontiguousarray(dt))
-        if _turns(motion, space):
-            _turn(space, moves, means, dt)
+        if motion.kind == "ct" and turns(space, frame):
+            turn(space, moves, means, dt, frame)
     return moves, noise
-
-
-def _turns(motion: Motion, space: tuple[str, ...]) -> bool:
-    return motion.kind == "ct" and {"turn_rate", "vx", "vy"} <= set(space) and not {"ax", "ay"} & set(space)
 
 
 def _kinematics(motion: Motion, space: tuple[str, ...], dt: Floats) -> tuple[Floats, Floats]:
@@ -217,33 +219,3 @@ def _or_series(u: Floats, low: int, c: Callable[[int], float], closed: Floats) -
     for _ in range(low):
         total = -small * total
     return np.where(u < SMALL_GAP, total, closed)
-
-
-def _turn(space: tuple[str, ...], transition: Floats, means: Floats, dt: Floats) -> Floats:
-    """The means (n, B) after the turn; `transition`, F of cv, becomes its Jacobian."""
-    ix, iy, ivx, ivy, iw = (space.index(name) for name in ("x", "y", "vx", "vy", "turn_rate"))
-    vx, vy, rate = means[ivx], means[ivy], means[iw]
-    angle = rate * dt
-    sine, cosine, half = np.sin(angle), np.cos(angle), np.sin(0.5 * angle)
-    versine = 2.0 * half * half
-    some = np.where(angle == 0.0, 1.0, angle)
-    along = dt * np.where(angle == 0.0, 1.0, sine / some)
-    across = dt * (versine / some)
-    # (t cos t - sin t) / t^2 and (t sin t - 1 + cos t) / t^2 lose their digits as t goes to 0: there, their series.
-    small, square = np.abs(angle) < SMALL_TURN, angle * angle
-    large = np.where(small, 1.0, angle)
-    series_s = -angle * (1 / 3 - square * (1 / 30 - square * (1 / 840 - square * (1 / 45360 - square / 3991680))))
-    series_c = 1 / 2 - square * (1 / 8 - square * (1 / 144 - square * (1 / 5760 - square * (1 / 403200))))
-    d_along = dt * dt * np.where(small, series_s, (large * cosine - sine) / (large * large))
-    d_across = dt * dt * np.where(small, series_c, (large * sine - versine) / (large * large))
-
-    transition[ivx, ivx], transition[ivx, ivy] = cosine, -sine
-    transition[ivy, ivx], transition[ivy, ivy] = sine, cosine
-    transition[ix, ivx], transition[ix, ivy] = along, -across
-    transition[iy, ivx], transition[iy, ivy] = across, along
-    predicted = matvec(transition, means)
-    transition[ivx, iw] = -dt * (sine * vx + cosine * vy)
-    transition[ivy, iw] = dt * (cosine * vx - sine * vy)
-    transition[ix, iw] = d_along * vx - d_across * vy
-    transition[iy, iw] = d_across * vx + d_along * vy
-    return predicted

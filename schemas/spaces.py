@@ -117,7 +117,7 @@ MOTIONS: dict[str, tuple[str, ...]] = {
     "ou": ("sigma", "tau", "q_turn"),
     "still": ("q", "sigma", "q_turn"),
 }
-"""Kind of motion -> the numbers it takes. q, sigma and tau must be given, but sigma of ca; q_turn is 0 by default."""
+"""Kind of motion -> the numbers it takes. All must be given, but q_turn and sigma of ca, which are 0 by default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,7 +138,7 @@ class Motion:
     """
 
     kind: str
-    q: float = 0.0
+    q: float = math.nan
     q_turn: float = 0.0
     sigma: float = 0.0
     tau: float = 0.0
@@ -147,10 +147,12 @@ class Motion:
         takes = MOTIONS.get(self.kind)
         if takes is None:
             raise ValueError(f"unknown motion {self.kind!r} (known: {', '.join(MOTIONS)})")
-        _number("q", self.q, 0.0, 1e12)
-        _number("q_turn", self.q_turn, 0.0, 1e12)
-        _number("sigma", self.sigma, 0.0, 1e6)
-        _number("tau", self.tau, 0.0, 1e9)
+        if math.isnan(self.q) and "q" not in takes:
+            object.__setattr__(self, "q", 0.0)
+        for name, most in (("q", 1e12), ("q_turn", 1e12), ("sigma", 1e6), ("tau", 1e9)):
+            if name == "q" and math.isnan(self.q):
+                raise ValueError(f"motion {self.kind} needs q")
+            _number(name, getattr(self, name), 0.0, most)
         for name in ("q", "sigma", "tau"):
             if getattr(self, name) and name not in takes:
                 raise ValueError(f"motion {self.kind} takes {', '.join(takes)}, not {name}")

@@ -255,11 +255,8 @@ def height(value: Any) -> Height:
 
 def motion(value: Any) -> Motion:
     kind = text(_map(value).get("kind"))
-    takes = MOTIONS.get(kind, ())
-    must = ["q"] if "q" in takes else []
-    rest = [name for name in ("q", "q_turn", "sigma", "tau") if name not in must]
-    parts = _parts(value, *must, **dict.fromkeys(rest, 0.0))
-    return Motion(kind, **dict(zip((*must, *rest), parts, strict=True)))
+    given = {name: value.get(name) for name in MOTIONS.get(kind, ())}
+    return Motion(kind, **{name: number(one) for name, one in given.items() if one is not None})
 
 
 def coverage(value: Any) -> Coverage:
