@@ -91,7 +91,7 @@ class FusionCentre(Centre):
     def _predicted(self, time: int) -> Picture:
         picture, config = self._picture, self.config
         dt = np.where(picture.time >= 0, time - picture.time, 0) / 1e9
-        return predict_tracks(picture, config.motion, config.space, config.space, dt)
+        return predict_tracks(picture, config.motion, config.space, config.space, dt, self._intake.frame)
 
     def _live(self, rows: Rows, time: int) -> None:
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()
