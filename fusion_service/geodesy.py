@@ -27,6 +27,7 @@ __all__ = [
     "geodetic_to_ecef",
     "geodetic_to_enu",
     "transform",
+    "vertical",
 ]
 
 Triple = tuple[Floats, Floats, Floats]
@@ -113,6 +114,17 @@ def transform(
         else:
             x, P = _on_surface(x, P, space, source, target, height or Height())
     return to_first(x, batch, 1), to_first(P, batch, 2)
+
+
+def vertical(means: Floats, space: tuple[str, ...], frame: Enu | Ecef) -> Floats:
+    """Up (3, B), of length 1 in the axes of `frame`, at the places of states (n, B) of `space`, which has x, y and z:
+    the outward normal of the ellipsoid. NaN at the centre of the earth."""
+    axes, centre = _axes(frame)
+    x, y, z = (means[space.index(name)] for name in "xyz")
+    with np.errstate(all="ignore"):
+        place = [centre[i] + axes[0, i] * x + axes[1, i] * y + axes[2, i] * z for i in range(3)]
+        normal, _ = _normal_and_altitude(*place)
+        return np.stack([_dot(list(row), normal) for row in axes])
 
 
 def _check(space: tuple[str, ...], source: Frame, target: Frame) -> None:

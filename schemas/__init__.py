@@ -21,6 +21,7 @@ from schemas.messages import (
 from schemas.numeric import FAULTS, check_numbers
 from schemas.spaces import (
     COMPONENTS,
+    MOTIONS,
     Coverage,
     Disk,
     Ecef,
@@ -40,6 +41,7 @@ __all__ = [
     "DECISIONS",
     "FAULTS",
     "MAX_BYTES",
+    "MOTIONS",
     "ORIGINS",
     "REALM",
     "REASONS",

@@ -13,6 +13,7 @@ from typing import ClassVar, TypeAlias
 
 __all__ = [
     "COMPONENTS",
+    "MOTIONS",
     "Coverage",
     "Disk",
     "Ecef",
@@ -108,24 +109,57 @@ class Height:
         _number("height sigma", self.sigma, 0.0, 1e8)
 
 
+MOTIONS: dict[str, tuple[str, ...]] = {
+    "cv": ("q", "q_turn"),
+    "ct": ("q", "q_turn"),
+    "ca": ("q", "sigma", "q_turn"),
+    "singer": ("sigma", "tau", "q_turn"),
+    "ou": ("sigma", "tau", "q_turn"),
+    "still": ("q", "sigma", "q_turn"),
+}
+"""Kind of motion -> the numbers it takes. All must be given, but q_turn and sigma of ca, which are 0 by default."""
+
+
 @dataclass(frozen=True, slots=True)
 class Motion:
-    """How a source's tracks move between its messages.
+    """How a source's tracks move between its messages: on each axis alike and independently.
 
     kind `cv`: nearly constant velocity, `q` the intensity of the white acceleration noise, m2/s3.
-    kind `ct`: coordinated turn at the state's turn_rate, `q` as for cv, `q_turn` the intensity of the
-    noise on the turn rate, rad2/s3.
+    kind `ct`: coordinated turn at the state's turn_rate, `q` as for cv.
+    kind `ca`: nearly constant acceleration, `q` the intensity of the white jerk, m2/s5; `sigma`, m/s2, the
+    standard deviation of the acceleration where the state does not have it (0: it is none).
+    kind `singer`: an acceleration of standard deviation `sigma`, m/s2, that is forgotten with time constant `tau`, s.
+    kind `ou`: a velocity of standard deviation `sigma`, m/s, that is forgotten with time constant `tau`, s
+    (Ornstein-Uhlenbeck): what stays about its place for a while.
+    kind `still`: anchored, moored or parked: the position walks at random with `q`, m2/s; a velocity is zero with
+    `sigma`, m/s.
+
+    In every kind `q_turn` is the intensity of the noise on a turn rate in the state, rad2/s3.
     """
 
     kind: str
-    q: float
+    q: float = math.nan
     q_turn: float = 0.0
+    sigma: float = 0.0
+    tau: float = 0.0
 
     def __post_init__(self) -> None:
-        if self.kind not in ("cv", "ct"):
-            raise ValueError(f"unknown motion {self.kind!r} (known: cv, ct)")
-        _number("q", self.q, 0.0, 1e12)
-        _number("q_turn", self.q_turn, 0.0, 1e12)
+        takes = MOTIONS.get(self.kind)
+        if takes is None:
+            raise ValueError(f"unknown motion {self.kind!r} (known: {', '.join(MOTIONS)})")
+        if math.isnan(self.q) and "q" not in takes:
+            object.__setattr__(self, "q", 0.0)
+        for name, most in (("q", 1e12), ("q_turn", 1e12), ("sigma", 1e6), ("tau", 1e9)):
+            if name == "q" and math.isnan(self.q):
+                raise ValueError(f"motion {self.kind} needs q")
+            _number(name, getattr(self, name), 0.0, most)
+        for name in ("q", "sigma", "tau"):
+            if getattr(self, name) and name not in takes:
+                raise ValueError(f"motion {self.kind} takes {', '.join(takes)}, not {name}")
+        if self.kind in ("singer", "ou", "still") and not self.sigma > 0:
+            raise ValueError(f"motion {self.kind} needs sigma, more than 0")
+        if "tau" in takes and not self.tau >= 1e-6:
+            raise ValueError(f"motion {self.kind} needs tau, at least 1e-06 s")
 
 
 @dataclass(frozen=True, slots=True)

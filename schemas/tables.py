@@ -113,7 +113,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("position", _POSITION, lambda xyz: [float(part) for part in xyz]),
         _covariances("position_covariance", "position_covariance", 2, optional=True),
         _plain("period", values.within(1e-6, 1e9), float),
-        _plain("motion", values.motion, values.pack_parts),
+        _plain("motion", values.motion, values.pack_motion),
         _plain("coverage", values.coverage, values.pack_kind, optional=True),
         _plain("detection_probability", values.within(0.0, 1.0), float, optional=True),
         _plain("initiation_delay", _SECONDS, float),

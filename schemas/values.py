@@ -17,7 +17,20 @@ from numpy.typing import NDArray
 
 from schemas.keys import check_name
 from schemas.messages import ORIGINS, Entry, Floats
-from schemas.spaces import Coverage, Disk, Ecef, Enu, Frame, Height, Local, Motion, Polygon, Sector, check_space
+from schemas.spaces import (
+    MOTIONS,
+    Coverage,
+    Disk,
+    Ecef,
+    Enu,
+    Frame,
+    Height,
+    Local,
+    Motion,
+    Polygon,
+    Sector,
+    check_space,
+)
 
 __all__ = [
     "Convert",
@@ -184,9 +197,14 @@ def pack_floats(value: dict[str, float]) -> dict[str, float]:
 
 
 def pack_parts(value: Any) -> dict[str, Any]:
-    """The attributes of a `Height` or `Motion` as a map."""
+    """The attributes of a `Height` or `Disk`, say, as a map."""
     parts = ((key, getattr(value, key)) for key in value.__slots__)
     return {key: part if isinstance(part, str) else float(part) for key, part in parts}
+
+
+def pack_motion(value: Any) -> dict[str, Any]:
+    """A motion as its kind and the numbers that it takes."""
+    return {"kind": value.kind, **{name: float(getattr(value, name)) for name in MOTIONS[value.kind]}}
 
 
 def pack_kind(value: Any) -> dict[str, Any]:
@@ -236,7 +254,9 @@ def height(value: Any) -> Height:
 
 
 def motion(value: Any) -> Motion:
-    return Motion(text(_map(value).get("kind")), *_parts(value, "q", q_turn=0.0))
+    kind = text(_map(value).get("kind"))
+    given = {name: value.get(name) for name in MOTIONS.get(kind, ())}
+    return Motion(kind, **{name: number(one) for name, one in given.items() if one is not None})
 
 
 def coverage(value: Any) -> Coverage:

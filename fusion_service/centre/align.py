@@ -19,7 +19,7 @@ from fusion_service.centre.stated_registration import shift_of
 from fusion_service.densities import Mixtures
 from fusion_service.metrics import chi2_quantile
 from fusion_service.motion import predict
-from schemas import Entry, Motion
+from schemas import Entry, Frame, Motion
 
 __all__ = ["predict_tracks", "usable_rows", "write_back"]
 
@@ -45,7 +45,8 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         if source.muted or not intake.ready(source):
             leave_out(source)
             continue
-        predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9)
+        age = (time - table.time) / 1e9
+        predicted = predict_tracks(table, said.motion, source.space, config.space, age, intake.frame)
         predicted = _shifted(predicted, shift_of(intake, source))
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
@@ -91,14 +92,19 @@ def _joined(parts: list[NDArray[Any]], kind: type[np.generic]) -> NDArray[Any]:
 
 
 def predict_tracks(
-    tracks: Columns, motion: Motion, space: tuple[str, ...], wanted: tuple[str, ...], dt: NDArray[np.float64]
+    tracks: Columns,
+    motion: Motion,
+    space: tuple[str, ...],
+    wanted: tuple[str, ...],
+    dt: NDArray[np.float64],
+    frame: Frame | None,
 ) -> Columns:
-    """Densities `dt` (T,) seconds later, marginalised from `space` to the components `wanted`."""
+    """Densities in `frame`, `dt` (T,) seconds later, marginalised from `space` to the components `wanted`."""
     at = [space.index(component) for component in wanted]
     some = np.ix_(at, at)
     components = len(tracks.log_weight)
     if not components:
-        mean, covariance = predict(motion, space, tracks.mean, tracks.covariance, dt)
+        mean, covariance = predict(motion, space, tracks.mean, tracks.covariance, dt, frame)
         parts = no_parts(len(at), len(dt))
         return replace(tracks, mean=mean[at], covariance=covariance[some], **dict(zip(PARTS, parts, strict=True)))
     n, count = tracks.mean.shape
@@ -108,6 +114,7 @@ def predict_tracks(
         tracks.part_mean.reshape(n, -1),
         tracks.part_covariance.reshape(n, n, -1),
         np.tile(dt, components),
+        frame,
     )
     means = means.reshape(n, components, count)[at]
     covariances = covariances.reshape(n, n, components, count)[some]

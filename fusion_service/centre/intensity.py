@@ -237,7 +237,9 @@ class IntensityCentre(Centre):
         """Bring the picture to `time` with the states as its tracks; share (N, G) of each source in each track."""
         fused, picture, config = self._fused, self._picture, self.config
         dt = np.where(picture.time >= 0, time - picture.time, 0) / 1e9
-        mean, covariance = predict(config.motion or USUAL, config.space, picture.mean, picture.covariance, dt)
+        mean, covariance = predict(
+            config.motion or USUAL, config.space, picture.mean, picture.covariance, dt, self._intake.frame
+        )
         picture = replace(picture, mean=mean, covariance=covariance)
         memory = self._memory.of(picture.id, time)
         place, number, lean, nearby = self._states(memory, picture, new)

@@ -33,7 +33,7 @@ class Memory:
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
         self._config = intake.config
-        self.motions = Motions(intake.config)
+        self.motions = Motions(intake)
         self.filters = Filters.none(len(intake.config.space))
         self.watch = Watch()
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.align import predict_tracks
+from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.sources import join_tracks, no_parts
-from fusion_service.config import CentreConfig
 from fusion_service.motion import predict
 from schemas import Motion
 
@@ -60,8 +60,8 @@ Kind = TypeVar("Kind", Picture, States)
 class Motions:
     """The motions that global tracks have: motion by code, `Picture.motion`; -1 is that of the config."""
 
-    def __init__(self, config: CentreConfig) -> None:
-        self._config = config
+    def __init__(self, intake: Intake) -> None:
+        self._intake, self._config = intake, intake.config
         self.known: list[Motion] = []
         self._noise: list[tuple[float, str]] = []
 
@@ -82,13 +82,13 @@ class Motions:
 
     def moved(self, tracks: Kind, codes: Codes, dt: NDArray[np.float64]) -> Kind:
         """Densities, in the centre's space, with these motions `dt` seconds later, each (T,)."""
-        space = self._config.space
+        space, frame = self._config.space, self._intake.frame
         kinds = np.unique(codes)
         if len(kinds) <= 1:
-            return predict_tracks(tracks, self.motion(int(kinds[0]) if len(kinds) else -1), space, space, dt)
+            return predict_tracks(tracks, self.motion(int(kinds[0]) if len(kinds) else -1), space, space, dt, frame)
         parts = [np.flatnonzero(codes == kind) for kind in kinds]
         moved = [
-            predict_tracks(tracks.take(at), self.motion(int(kind)), space, space, dt[at])
+            predict_tracks(tracks.take(at), self.motion(int(kind)), space, space, dt[at], frame)
             for kind, at in zip(kinds, parts, strict=True)
         ]
         return join_tracks(moved).take(np.argsort(np.concatenate(parts), kind="stable"))

@@ -253,7 +253,7 @@ class ShownTracks:
             means = np.concatenate([part.means for part in parts])
             covariances = np.concatenate([part.covariances for part in parts])
             dt = np.repeat(age, sizes[chosen])
-            x, P = predict(self._motion, space, means.T, np.moveaxis(covariances, 0, -1), dt)
+            x, P = predict(self._motion, space, means.T, np.moveaxis(covariances, 0, -1), dt, self._frame)
             rows = np.repeat(begins[chosen] - (np.cumsum(sizes[chosen]) - sizes[chosen]), sizes[chosen])
             rows += np.arange(len(rows))
             for column, name in enumerate(names):

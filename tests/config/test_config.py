@@ -65,7 +65,7 @@ x = 1
     assert "must be one of: " in told[f"{path}:2"]
     assert "unknown key (known: " in told[f"{path}:4"]
     assert "'warp'" in told[f"{path}:5"]
-    assert "centre.sources.radar1.motion: has the keys kind, wants: kind, q, q_turn" in told[f"{path}:9"]
+    assert "centre.sources.radar1.motion: motion cv needs q" in told[f"{path}:9"]
 
 
 @pytest.mark.parametrize(
@@ -92,6 +92,11 @@ def test_what_is_wrong_is_said(raw: dict[str, object], words: str) -> None:
     [
         ('[centre]\nframe = {kind = ["enu"], lat = 1, lon = 2}\n', 2, "centre.frame: has kind ['enu'], must be one of"),
         ('[centre]\nmotion = {kind = "cv", q = "1"}\n', 2, "centre.motion: q is '1', must be a number"),
+        ('[centre]\nmotion = {kind = "warp", q = 1}\n', 2, "centre.motion: unknown motion 'warp' (known: cv, ct, ca, "),
+        ('[centre]\nmotion = {kind = "ou", sigma = 1}\n', 2, "centre.motion: motion ou needs tau, at least 1e-06 s"),
+        ('[centre]\nmotion = {kind = "ou", q = 1, tau = 9}\n', 2, "motion ou takes sigma, tau, q_turn, not q"),
+        ('[centre]\nmotion = {kind = "singer", tau = 9}\n', 2, "motion singer needs sigma, more than 0"),
+        ('[centre]\nmotion = {kind = "still", q = -1}\n', 2, "centre.motion: q is -1.0, not a number from 0"),
         ('[centre]\nframe = {kind = "enu", lat = "59", lon = 1}\n', 2, "centre.frame: lat is '59', must be a number"),
         ('[centre]\nframe = {kind = "local", name = 3}\n', 2, "centre.frame: name is 3, must be a text"),
         (f"[centre]\nperiod = 1{'0' * 400}\n", 2, "centre.period: "),

@@ -34,8 +34,10 @@ def plain(value: Any) -> Any:
         return [plain(item) for item in value]
     if isinstance(value, schemas.Entry):
         return [value.source, value.epoch, value.seq, value.hash, value.reason, value.count]
+    if isinstance(value, schemas.Motion):
+        return {"kind": value.kind} | {name: plain(getattr(value, name)) for name in schemas.MOTIONS[value.kind]}
     if hasattr(value, "__slots__"):
-        kind = {} if isinstance(value, (schemas.Height, schemas.Motion)) else {"kind": value.kind}
+        kind = {} if isinstance(value, schemas.Height) else {"kind": value.kind}
         return kind | {name: plain(getattr(value, name)) for name in value.__slots__}
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}

@@ -66,7 +66,7 @@ def test_words_are_those_of_the_code() -> None:
         )
     assert all(f"`{origin}`" in SECTIONS["Header"] for origin in schemas.ORIGINS)
     kinds = set(re.findall(r'^\| `\{"kind": "(\w+)"', PAGE, flags=re.M))
-    assert kinds == {"enu", "ecef", "local", "disk", "sector", "polygon", "cv", "ct"}
+    assert kinds == {"enu", "ecef", "local", "disk", "sector", "polygon", *schemas.MOTIONS}
 
 
 def test_numbers_are_those_of_the_code() -> None:

@@ -77,12 +77,21 @@ def reference_for(
         period = info.period if info else book.traffic["local", name].interval
         motions["local", name] = info.motion if info else motion or Motion("cv", 1.0)
         limits["local", name] = STALE_PERIODS * period
-    drift = Motion("cv", max((book.infos[name].motion.q for name in sources if name in book.infos), default=1.0))
+    drift = Motion("cv", max((_jolt(book.infos[name].motion) for name in sources if name in book.infos), default=1.0))
     for name in centres:
         motions["global", name] = drift
         limits["global", name] = STALE_STEPS * book.traffic["global", name].interval
     speeds = tuple(f"v{name}" for name in axes)
     return Reference(frame, axes, speeds, sources, list(centres), left_out, motions, limits, c)
+
+
+def _jolt(motion: Motion) -> float:
+    """Intensity of the white acceleration noise, m2/s3, that covers a motion between two steps; of ca and still 0."""
+    if motion.kind == "singer":
+        return 2 * motion.sigma**2 * motion.tau
+    if motion.kind == "ou":
+        return 2 * motion.sigma**2 / motion.tau
+    return motion.q if motion.kind in ("cv", "ct") else 0.0
 
 
 def scored_truth(
