@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.align import predict_tracks, write_back
 from fusion_service.centre.centre import Centre
+from fusion_service.centre.correlation import declared_correlation
 from fusion_service.centre.existence import Entries, update_existence
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.lifecycle import Picture, Support
@@ -55,7 +56,9 @@ class FusionCentre(Centre):
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         now = self._associate(rows, names, time)
-        self._picture, influence = fuse_all(rows, now, time, self.config, self._journal)
+        self._picture, influence = fuse_all(
+            rows, now, time, declared_correlation(self._intake, self.config), self._journal
+        )
         self._live(rows, time)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
