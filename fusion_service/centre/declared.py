@@ -32,6 +32,7 @@ def declared_by(said: SourceConfig, info: SensorInfo | None) -> SourceConfig:
         ),
         initiation_delay=own.initiation_delay or other.initiation_delay or 0.0,
         feedback=said.feedback or bool(info.feedback),
+        correlation_group=own.correlation_group or other.correlation_group,
     )
     return said if said.override else replace(said, period=info.period, motion=info.motion, may_start=info.may_start)
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.association import by_size, uniform_ci
+from fusion_service.centre.correlation import Correlation
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
@@ -36,15 +37,16 @@ twelve sources moments are fused."""
 
 
 def fuse_all(
-    rows: Rows, picture: Picture, time: int, config: CentreConfig, journal: Journal, left: Bools | None = None
+    rows: Rows, picture: Picture, time: int, known: Correlation, journal: Journal, left: Bools | None = None
 ) -> tuple[Picture, Floats]:
     """The picture after fusion, and the influence (M,) of each row: trace(K)/n of its gain, 0 where it brought
     nothing new, NaN where it has no link.
 
-    picture: predicted to `time`, ns. Of a mixture fused as such the influence is that of its moments; with
-    recursive memory it is the product of the shares in the two stages. left (M,): rows that are not to be fused here.
+    picture: predicted to `time`, ns; known: of the rows' correlation. Of a mixture fused as such the influence is that
+    of its moments; with recursive memory it is the product of the shares in the two stages. left (M,): rows that
+    are not to be fused here.
     """
-    tracks = rows.tracks
+    tracks, config = rows.tracks, known.config
     linked = (tracks.link != NO_TRACK) & ~tracks.outside
     influence = np.where(tracks.link != NO_TRACK, 0.0, np.nan)
     linked = linked if left is None else linked & ~left
@@ -56,7 +58,7 @@ def fuse_all(
     done: list[Ints] = []
     for ids, groups in by_size(tracks.link[chosen]):
         at, members = picture.find(ids), chosen[groups]
-        one, spread, gains = _gaussian(rows, members, config, journal)
+        one, spread, gains = _gaussian(rows, members, known, journal)
         parts, several = _as_mixtures(rows, members, config)
         if parts is not None:
             one[:, several], spread[:, :, several] = parts.moments()
@@ -72,11 +74,12 @@ def fuse_all(
     return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
-def _gaussian(rows: Rows, members: Ints, config: CentreConfig, journal: Journal) -> tuple[Floats, Floats, Floats]:
+def _gaussian(rows: Rows, members: Ints, known: Correlation, journal: Journal) -> tuple[Floats, Floats, Floats]:
+    config = known.config
     means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
     covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
     weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
-    fused = fuse_last(config.rule, means, covariances, weights, influence=True, **config.rule_options)
+    fused = known.fuse(rows, members, means, covariances, weights)
     one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
     bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
     if bad.any():

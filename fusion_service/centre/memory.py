@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.centre.correlation import declared_correlation
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.increments import Increments, increments
 from fusion_service.centre.intake import Intake
@@ -42,8 +43,9 @@ class Memory:
     ) -> tuple[Picture, Floats]:
         """The picture of the step at `time`, ns, and the influence (M,) of each row, as `fusing.fuse_all`. before:
         the picture after the last step, `now` the same predicted to `time`."""
+        known = declared_correlation(self._intake, self._config)
         if self._config.memory != "tracklet":
-            picture, influence = fuse_all(rows, now, time, self._config, journal)
+            picture, influence = fuse_all(rows, now, time, known, journal)
             return self._moving(rows, names, picture), influence
         for event in self.watch.begin(self._intake, names):
             journal.event(event)
@@ -53,7 +55,7 @@ class Memory:
         filtered[at[capable & (at >= 0)]] = True
         filtered[-1] = False
         filtered[:-1] &= before.time >= 0
-        picture, influence = fuse_all(rows, now, time, self._config, journal, filtered[at])
+        picture, influence = fuse_all(rows, now, time, known, journal, filtered[at])
         ruled = np.zeros(len(now.id) + 1, dtype=np.bool_)
         ruled[at[~filtered[at]]] = True
         picture = self._filter(rows, names, before, picture, influence, at, capable, filtered, ruled[:-1], step, time)

@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
+from fusion_service.config.correlation import rule_options
 from fusion_service.config.readers import (
     DURATION,
     POSITIVE,
@@ -87,6 +88,9 @@ class SourceConfig:
     )
     false_track: float = _setting(0.1, number(1e-6, 1), "chance that a report of a track of it is of nothing")
     covariance_floor: float = _setting(0.0, DURATION, "sigma added to its positions, m")
+    correlation_group: str | None = _setting(
+        None, maybe(text), "sources of one group share errors (rule bci, max_correlation); left out: its own"
+    )
     registration_sigma: float = _setting(
         0.0, number(0.0, 1e5), "kind = intensity: m, error common to all it reports; SensorInfo: position_covariance"
     )
@@ -114,7 +118,7 @@ class CentreConfig:
     lateness: float = _setting(5.0, DURATION, "how late a message may be, seconds")
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
     rule: str = _setting("ci", read_rule, "fusion rule (fusion-service rules lists them)")
-    rule_options: dict[str, Any] = _setting({}, table, "options of the rule, e.g. {criterion = 'trace'}")
+    rule_options: dict[str, Any] = _setting({}, rule_options, "options of the rule, e.g. {criterion = 'trace'}")
     mixture_rule: str = _setting("moments", read_mixture_rule, "rule for mixtures; moments: as Gaussians, by the rule")
     mixture_options: dict[str, Any] = _setting({}, table, "options of the mixture rule")
     max_components: int = _setting(8, whole(1, 100), "components kept of a mixture")

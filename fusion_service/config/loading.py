@@ -19,6 +19,7 @@ from fusion_service.config.config import (
     ServiceConfig,
     SourceConfig,
 )
+from fusion_service.config.correlation import tried
 from fusion_service.config.toml_text import dotted, key_lines, line_of
 from schemas import Ecef, check_name
 
@@ -141,20 +142,24 @@ def _rule_problems(config: CentreConfig) -> list[str]:
     """Why the centre cannot fuse by this rule and its options: it is tried on one to three unit Gaussians."""
     from fusion_service.rules import RULES, RuleError, fuse_last
 
-    options = RULES[config.rule].options
-    unknown = [name for name in config.rule_options if name not in options]
+    try:
+        rule, few = tried(config.rule, config.rule_options)
+    except ValueError as error:
+        return [str(error)]
+    options = RULES[rule].options
+    unknown = [name for name in few if name not in options]
     if unknown:
         known = ", ".join(options) or "none"
-        return [f"{config.rule} has no option {name!r} (known: {known})" for name in unknown]
-    n, few = len(config.space), dict(config.rule_options)
+        return [f"{rule} has no option {name!r} (known: {known})" for name in unknown]
+    n = len(config.space)
     if isinstance(few.get("samples"), int):
         few["samples"] = min(few["samples"], 1000)
     for count in (1, 2, 3):
         mean, covariance = np.zeros((count, n, 1)), np.tile(np.eye(n)[:, :, None], (count, 1, 1, 1))
         try:
-            fused = fuse_last(config.rule, mean, covariance, influence=True, **few)
+            fused = fuse_last(rule, mean, covariance, influence=True, **few)
         except (RuleError, TypeError, ValueError, OverflowError) as error:
-            return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} here: {error}"]
+            return [f"{rule} cannot fuse {count} source{'s' * (count > 1)} here: {error}"]
         if not np.isfinite(fused.covariance).all():
-            return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} of unit covariance here"]
+            return [f"{rule} cannot fuse {count} source{'s' * (count > 1)} of unit covariance here"]
     return []

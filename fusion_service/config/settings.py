@@ -40,8 +40,11 @@ def plain_settings(config: CentreConfig) -> dict[str, Any]:
 
 
 def _shallow(key: tuple[str, ...], value: Any) -> dict[str, Any]:
-    """The setting under its key; the corners of a polygon, too deep for an event of a step log, under their own."""
+    """The setting under its key; what would be too deep for an event of a step log, the corners of a polygon and the
+    entries of a table in a table, under keys of their own."""
     table = _plain(value)
+    if isinstance(value, Mapping):
+        return {dotted((*key, name)): part for name, part in table.items()}
     if not isinstance(value, SourceConfig) or not isinstance(value.coverage, Polygon):
         return {dotted(key): table}
     polygon = table.pop("coverage")

@@ -21,6 +21,7 @@ from fusion_service.rules.base.options import CRITERION
 from fusion_service.rules.base.rule import Rule
 from fusion_service.rules.base.scales import SCALES, in_scales
 from fusion_service.rules.weights import simplex
+from fusion_service.rules.weights.pairs import is_one, of_elements
 from fusion_service.rules.weights.two import best_of_two
 
 __all__ = ["RULE", "ci", "intersection"]
@@ -42,10 +43,13 @@ RULE = Rule(
 )
 
 
-def intersection(sources: Sources, weights: Floats | None, influence: bool, criterion: str, rho: float) -> Result:
-    """The intersection of the sources inflated for correlations up to rho: CI for 1, the naive rule for 0."""
+def intersection(
+    sources: Sources, weights: Floats | None, influence: bool, criterion: str, rho: float | Floats
+) -> Result:
+    """The intersection of the sources inflated for correlations up to rho, a number or (B,) positive ones: CI for 1,
+    the naive rule for 0."""
     model = Inflated(sources.information, rho)
-    optimise = weights is None and rho > 0.0 and sources.count > 1
+    optimise = weights is None and not (isinstance(rho, float) and rho == 0.0) and sources.count > 1
     w = sources.uniform if weights is None else weights
     if optimise and sources.count == 2:
         A, P, dets = model.A, sources.covariances, 1.0 / sources.dets
@@ -69,13 +73,13 @@ class Inflated:
     """M(w) = sum c(w_i) A_i, c(w) = w / ((1-rho) w + rho)."""
 
     A: Floats  # (n, n, N, B)
-    rho: float
+    rho: float | Floats  # a number, or (B,)
 
     def scale(self, w: Floats) -> tuple[Floats, Floats | float, Floats | float]:
         """c, c' and c''."""
-        if self.rho == 1.0:
+        if is_one(self.rho):
             return w, 1.0, 0.0
-        if self.rho == 0.0:
+        if isinstance(self.rho, float) and self.rho == 0.0:
             return np.ones_like(w), 0.0, 0.0
         d = (1.0 - self.rho) * w + self.rho
         slope = self.rho / (d * d)
@@ -86,9 +90,9 @@ class Inflated:
         return weighted_sum(self.A, c), self.A * slope
 
     def bend(self, w: Floats, G: Floats) -> Floats | None:
-        if self.rho == 1.0:
+        if is_one(self.rho):
             return None
         return diagonal(-self.scale(w)[2] * inner(G[:, :, None], self.A))
 
     def take(self, index: Bools) -> Self:
-        return replace(self, A=self.A[..., index])
+        return replace(self, A=self.A[..., index], rho=of_elements(self.rho, index))

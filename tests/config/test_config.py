@@ -20,6 +20,7 @@ from fusion_service.config import (
     example_toml,
     load_config,
 )
+from fusion_service.config.correlation import group_bounds
 from fusion_service.rules import RULES
 
 
@@ -125,6 +126,11 @@ def test_what_no_parser_can_take_is_no_toml(tmp_path: Path, text: str) -> None:
         load(tmp_path, text)
 
 
+def bounds(**table: object) -> dict[str, object]:
+    """A config of `bci` with bounds between groups."""
+    return {"rule": "bci", "rule_options": {"max_correlation": table}}
+
+
 @pytest.mark.parametrize(
     ("raw", "key", "words"),
     [
@@ -133,7 +139,17 @@ def test_what_no_parser_can_take_is_no_toml(tmp_path: Path, text: str) -> None:
         ({"rule": "bci", "rule_options": {"max_correlation": [[1, 0], [0, 1]]}}, "rule_options", "has shape (2, 2)"),
         ({"rule_options": {"scales": [1.0, 1.0]}}, "rule_options", "4 positive numbers"),
         ({"rule": "hmd-s", "rule_options": {"seed": "x"}}, "rule_options", "seed 'x': a whole number"),
-        ({"rule": "bar-shalom-campo"}, "rule", "takes two sources"),
+        ({"rule": "bar-shalom-campo"}, "rule", 'needs rule_options = {cross = "derived"}'),
+        ({"rule": "bar-shalom-campo", "rule_options": {"cross": "known"}}, "rule_options", "not 'known'"),
+        ({"rule": "bar-shalom-campo", "rule_options": {"a": 1, "cross": "derived"}}, "rule_options", "no option 'a'"),
+        ({"rule": "bci", "rule_options": {"max_correlation": "guessed"}}, "rule_options", "not an array of numbers"),
+        (bounds(within=1.5), "rule_options", "max_correlation.within is 1.5, must be a number from 0 to 1"),
+        (bounds(beyond=0.5), "rule_options", "max_correlation has no key 'beyond'"),
+        (bounds(pairs={"a": 1}), "rule_options", "max_correlation.pairs is"),
+        (bounds(pairs=[{"groups": ["a"], "bound": 0.5}]), "rule_options", "wants {groups"),
+        (bounds(pairs=[{"groups": ["a", 3], "bound": 0.5}]), "rule_options", "a group is 3, must be a text"),
+        (bounds(pairs=[{"groups": ["a", "b"], "bound": "x"}]), "rule_options", "bound is 'x'"),
+        (bounds(pairs=2 * [{"groups": ["a", "b"], "bound": 1}]), "rule_options", "names a and b twice"),
     ],
 )
 def test_a_rule_that_could_not_fuse_in_the_centre_is_told(raw: dict[str, object], key: str, words: str) -> None:
@@ -142,6 +158,21 @@ def test_a_rule_that_could_not_fuse_in_the_centre_is_told(raw: dict[str, object]
     (problem,) = caught.value.problems
     assert problem.startswith(f"{key}: ")
     assert words in problem
+
+
+def test_bounds_between_groups_are_read(tmp_path: Path) -> None:
+    config = load(
+        tmp_path,
+        '[centre]\nrule = "bci"\n[centre.rule_options.max_correlation]\nbetween = 0.2\n'
+        'pairs = [{groups = ["shore", "nav"], bound = 0.5}, {groups = ["nav", "nav"], bound = 0.9}]\n',
+    ).centre
+    table = group_bounds(config.rule_options)
+    assert table is not None
+    asked = [("nav", "shore"), ("shore", "nav"), ("nav", "nav"), ("shore", "shore"), ("nav", "x"), ("x", "x")]
+    assert [table.of(*pair) for pair in asked] == [0.5, 0.5, 0.9, 1.0, 0.2, 1.0]
+    assert group_bounds({}) is None
+    assert centre_config({"rule": "bci", "rule_options": {"max_correlation": "derived"}}).rule == "bci"
+    assert centre_config({"rule": "bar-shalom-campo", "rule_options": {"cross": "derived"}}).rule == "bar-shalom-campo"
 
 
 def test_every_other_rule_can_be_chosen_in_four_and_in_nine_dimensions() -> None:

@@ -112,6 +112,8 @@ def test_neither_input_nor_given_weights_are_changed() -> None:
         np.testing.assert_array_equal(a, b)
 
 
+LOPSIDED = np.zeros((2, 2, 3, 3))
+LOPSIDED[0, 1, 0, 1] = 0.5
 X, P2 = np.zeros((5, 2, 3)), np.broadcast_to(np.eye(3), (5, 2, 3, 3))
 
 
@@ -148,6 +150,8 @@ def spoiled(index: tuple[int, ...], value: float, a: Floats) -> Floats:
         ("bci", X, P2, {"max_correlation": 1.1}, "between 0 and 1"),
         ("bci", X, P2, {"max_correlation": np.nan}, "between 0 and 1"),
         ("bci", X, P2, {"max_correlation": np.eye(3)}, "a number or (2, 2)"),
+        ("bci", X, P2, {"max_correlation": np.ones((4, 2, 2))}, "one (2, 2) for each of"),
+        ("bci", X, P2, {"max_correlation": np.full((1, 2, 2), 0.5)}, "ones on its diagonal"),
         ("bci", X, P2, {"max_correlation": [[1, 0.2], [0.3, 1]]}, "symmetric"),
         ("bci", X, P2, {"max_correlation": [[0.5, 0.2], [0.2, 1]]}, "ones on its diagonal"),
         ("ci", X, P2, {"scales": [1.0, 2.0]}, "3 positive numbers"),
@@ -162,7 +166,8 @@ def spoiled(index: tuple[int, ...], value: float, a: Floats) -> Floats:
         ("hmd-s", X, P2, {"samples": 10}, "at least 200"),
         ("gmd-s", X, P2, {"seed": 1.5}, "whole number"),
         ("bar-shalom-campo", X, P2, {}, "needs the option cross_covariance"),
-        ("bar-shalom-campo", X[:, :1], P2[:, :1], {"cross_covariance": np.eye(3)}, "takes two sources, not 1"),
+        ("bar-shalom-campo", X[:, [0, 1, 1]], P2[:, [0, 1, 1]], {"cross_covariance": np.eye(3)}, "does not fit"),
+        ("bar-shalom-campo", X, P2, {"cross_covariance": LOPSIDED}, "each other's transpose"),
         ("bar-shalom-campo", X, P2, {"cross_covariance": np.eye(2)}, "cross_covariance (2, 2) does not fit"),
         ("bar-shalom-campo", X, P2, {"cross_covariance": np.full((3, 3), np.nan)}, "cross_covariance is not finite"),
         ("bar-shalom-campo", X, P2, {"cross_covariance": 1.1 * np.eye(3)}, "joint covariance is not positive definite"),

@@ -218,3 +218,55 @@ def test_a_correlation_beyond_the_bound_does_break_it() -> None:
     fused = fuse("bci", np.zeros((2, 2)), P, max_correlation=0.1)
     gains = gains_of(P, inflation(fused.weights, 0.1), fused.covariance)
     assert worst_ratio(P, fused.covariance, gains, np.array([[1.0, 0.9], [0.9, 1.0]])) > 1.2
+
+
+def own_bounds(rng: np.random.Generator, B: int, N: int) -> Floats:
+    """Bounds of each fusion's own (B, N, N); those of 0 and 1 among them."""
+    R = rng.choice([0.0, 0.2, 0.5, 0.9, 1.0], size=(B, N, N))
+    R = np.maximum(R, R.swapaxes(1, 2))
+    R[:, range(N), range(N)] = 1.0
+    return np.asarray(R)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+@pytest.mark.parametrize("N", [1, 2, 3, 5])
+def test_bounds_of_each_fusions_own(N: int, criterion: str) -> None:
+    """Conservative for the worst within them, as good as those of one number where there is one, and nobody's bits
+    depend on the others'."""
+    rng = np.random.default_rng(SEED)
+    B = 8
+    drawn = [sources(rng, N, 3) for _ in range(B)]
+    x, P = (np.stack(a) for a in zip(*drawn, strict=True))
+    R = own_bounds(rng, B, N)
+    fused = fuse("bci", x, P, max_correlation=R, criterion=criterion, influence=True)
+    assert fused.influence is not None
+    np.testing.assert_allclose(fused.influence.sum(axis=-1), 1.0)
+    for b in range(B):
+        one = fuse("bci", x[b : b + 1], P[b : b + 1], max_correlation=R[b : b + 1], criterion=criterion)
+        np.testing.assert_array_equal(one.covariance[0], fused.covariance[b])
+        np.testing.assert_array_equal(one.mean[0], fused.mean[b])
+        c = np.linalg.lstsq(
+            np.linalg.inv(P[b]).reshape(N, -1).T, np.linalg.inv(fused.covariance[b]).ravel(), rcond=None
+        )[0]
+        gains = gains_of(P[b], c, fused.covariance[b])
+        np.testing.assert_allclose(gains.sum(axis=0), np.eye(3), atol=1e-6)
+        assert worst_ratio(P[b], fused.covariance[b], gains, R[b]) <= 1.0 + 1e-5
+        if N == 2:
+            same = fuse("bci", x[b], P[b], max_correlation=max(float(R[b, 0, 1]), 1e-6), criterion=criterion)
+            np.testing.assert_allclose(same.covariance, fused.covariance[b], rtol=1e-5)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_quick_weights_are_nearly_the_best(criterion: str) -> None:
+    rng = np.random.default_rng(SEED)
+    lost = []
+    for _ in range(15):
+        x, P = sources(rng, 3, 4)
+        R = own_bounds(rng, 1, 3)
+        quick = fuse("bci", x[None], P[None], max_correlation=R, criterion=criterion)
+        best = fuse("bci", x, P, max_correlation=R[0], criterion=criterion)
+        lost.append(
+            cost(criterion, np.linalg.inv(quick.covariance[0])) - cost(criterion, np.linalg.inv(best.covariance))
+        )
+    assert np.mean(lost) < 0.01
+    assert max(lost) < 0.15

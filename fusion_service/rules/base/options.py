@@ -49,12 +49,13 @@ Check = Callable[[str, Any, Case], Any]
 
 @dataclass(frozen=True, slots=True)
 class Option:
-    """One option of a rule: its default, its check (None: anything goes), and whether it has an element for each
-    fusion of the batch, along its last axis once it is checked."""
+    """One option of a rule: its default, its check (None: anything goes), and, where it may have an element for each
+    fusion of the batch, the number of axes that one has (`per_element`): once checked, a value of more axes has the
+    batch along its last one."""
 
     default: Any
     check: Check | None = None
-    per_element: bool = False
+    per_element: int = 0
 
 
 def array(name: str, value: Any) -> Floats:

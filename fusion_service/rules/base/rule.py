@@ -20,6 +20,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from fusion_service.arrays import Floats
 from fusion_service.densities import Mixtures
 from fusion_service.rules.base.block import Result
@@ -61,7 +63,11 @@ class Rule(Declaration):
 
     def part(self, chosen: dict[str, Any], index: Any) -> dict[str, Any]:
         """The chosen options of some elements of the batch."""
-        each = [name for name, option in self.takes.items() if option.per_element]
+        each = [
+            name
+            for name, option in self.takes.items()
+            if option.per_element and np.ndim(chosen[name]) > option.per_element
+        ]
         return chosen | {name: chosen[name][..., index] for name in each} if each else chosen
 
 

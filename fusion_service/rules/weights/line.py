@@ -11,7 +11,7 @@ import numpy as np
 from fusion_service import linalg
 from fusion_service.arrays import Floats
 from fusion_service.linalg import inner, matvec, outer, product, total, trace
-from fusion_service.rules.weights.pairs import FLAT, Ends
+from fusion_service.rules.weights.pairs import FLAT, Ends, of_elements
 
 __all__ = ["best_weight", "spread_inverse"]
 
@@ -20,7 +20,7 @@ DONE = 1e-11
 """Slope, relative to the criterion, that counts as zero."""
 
 
-def best_weight(criterion: str, M: Ends, *, bump: Floats | None = None, rho: float = 1.0) -> Floats:
+def best_weight(criterion: str, M: Ends, *, bump: Floats | None = None, rho: float | Floats = 1.0) -> Floats:
     """The t (B,) in [0, 1] with the largest det M(t), or the smallest trace M(t)^-1; M as in `pairs.best_weight`."""
     size = M[0].shape[-1]
     lo, hi = np.zeros((2, size), M[0].dtype)
@@ -35,7 +35,7 @@ def best_weight(criterion: str, M: Ends, *, bump: Floats | None = None, rho: flo
         if not len(at):
             break
         ends = M[0][..., at], M[1][..., at]
-        h, dh = _slope(criterion, t, ends, None if bump is None else bump[:, at], rho)
+        h, dh = _slope(criterion, t, ends, None if bump is None else bump[:, at], of_elements(rho, at))
         lo, hi = np.where(h > 0.0, t, lo), np.where(h > 0.0, hi, t)
         step = h / dh
         new = t - step
@@ -54,7 +54,7 @@ def spread_inverse(U: Floats, d: Floats, tau: Floats) -> tuple[Floats, Floats]:
     return U - outer(tau * e, y), e
 
 
-def _slope(criterion: str, t: Floats, M: Ends, bump: Floats | None, rho: float) -> tuple[Floats, Floats]:
+def _slope(criterion: str, t: Floats, M: Ends, bump: Floats | None, rho: float | Floats) -> tuple[Floats, Floats]:
     """First and second derivative of log det M, or of -log trace M^-1."""
     d0, d1 = (1.0 - rho) * (1.0 - t) + rho, (1.0 - rho) * t + rho
     G = (1.0 - t) / d0 * M[0] + t / d1 * M[1]

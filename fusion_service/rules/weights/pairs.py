@@ -19,10 +19,10 @@ from functools import cache
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.linalg import total
 
-__all__ = ["FLAT", "LIMIT", "Ends", "best_weight"]
+__all__ = ["FLAT", "LIMIT", "Ends", "best_weight", "is_one", "of_elements"]
 
 LIMIT = 6
 ROUNDS = 60
@@ -37,13 +37,13 @@ Ends = tuple[Floats, Floats]
 
 
 def best_weight(
-    criterion: str, M: Ends, inverses: Ends, dets: Ends, *, bump: Floats | None = None, rho: float = 1.0
+    criterion: str, M: Ends, inverses: Ends, dets: Ends, *, bump: Floats | None = None, rho: float | Floats = 1.0
 ) -> Floats:
     """The t (B,) in [0, 1] with the largest det M(t), or the smallest trace M(t)^-1.
 
     M(t) = (1-t) M0 + t M1 + t(1-t) bump bump', with bump (n, B) or None; or, for rho < 1,
-    M(t) = c(1-t) M0 + c(t) M1 with c(w) = w / ((1-rho) w + rho). `M` is (M0, M1), each (n, n, B);
-    `inverses` and `dets` are theirs.
+    M(t) = c(1-t) M0 + c(t) M1 with c(w) = w / ((1-rho) w + rho), rho one number or (B,) positive ones. `M` is
+    (M0, M1), each (n, n, B); `inverses` and `dets` are theirs.
     """
     n, size = M[0].shape[0], M[0].shape[-1]
     degree = n + (bump is not None)
@@ -61,12 +61,12 @@ def best_weight(
     if criterion == "det":
         if len(t):
             det[2 + slopes :, 0] = linalg.det(between)
-        if bump is None and rho == 1.0:
+        if bump is None and is_one(rho):
             q = _combine(_polar(n, slopes), det[:, 0])
             np.multiply(first, dets[0], out=q[0])
             np.multiply(last, dets[1], out=q[-1])
             return _laguerre(q, first, last)
-        ends = ((first + n) / rho - rho * n, rho * n - (n - last) / rho) if rho < 1.0 else (first, last)
+        ends = (first, last) if is_one(rho) else ((first + n) / rho - rho * n, rho * n - (n - last) / rho)
         return _newton(_det_slope, _combine(_monomials(degree, slopes), det), n, rho, ends)
     adjugate = np.empty((2 + len(t), 1, size))
     for row, inverse, value in zip(adjugate[:2, 0], inverses, dets, strict=True):
@@ -78,6 +78,16 @@ def best_weight(
     c[:, :1] = _combine(_monomials(degree, slopes), det)
     c[: len(adjugate), 1:] = _combine(_monomials(len(adjugate) - 1, 0), adjugate)
     return _newton(_trace_slope, c, n, rho)
+
+
+def is_one(rho: float | Floats) -> bool:
+    """Whether this is the number 1, where nothing is bounded; (B,) numbers never are."""
+    return isinstance(rho, float) and rho == 1.0
+
+
+def of_elements(rho: float | Floats, at: Ints | Bools) -> float | Floats:
+    """rho of some elements of the batch."""
+    return rho if isinstance(rho, float) else rho[at]
 
 
 def _between(M: Ends, bump: Floats | None, t: Floats) -> Floats:
@@ -202,7 +212,7 @@ def _polynomials(t: Floats, c: Floats) -> Floats:
     return out
 
 
-def _share(t: Floats, rho: float) -> tuple[Floats, ...]:
+def _share(t: Floats, rho: float | Floats) -> tuple[Floats, ...]:
     """s = c(t) + c(1-t) and r = c(t) / s, each with its first and second derivative."""
     d0, d1 = (1.0 - rho) * (1.0 - t) + rho, (1.0 - rho) * t + rho
     c1 = t / d1
@@ -216,9 +226,9 @@ def _share(t: Floats, rho: float) -> tuple[Floats, ...]:
     return s, ds, dds, r, dr, (bend1 - r * dds - 2.0 * dr * ds) / s
 
 
-def _det_slope(t: Floats, c: Floats, n: int, rho: float) -> tuple[Floats, Floats]:
+def _det_slope(t: Floats, c: Floats, n: int, rho: float | Floats) -> tuple[Floats, Floats]:
     """First and second derivative of log det M."""
-    if rho == 1.0:
+    if is_one(rho):
         (f,), (df,), (ddf,) = _polynomials(t, c)
         first = df / f
         return first, ddf / f - first * first
@@ -228,9 +238,9 @@ def _det_slope(t: Floats, c: Floats, n: int, rho: float) -> tuple[Floats, Floats
     return u * dr + n * v, (ddf / f - u * u) * dr * dr + u * ddr + n * (dds / s - v * v)
 
 
-def _trace_slope(t: Floats, c: Floats, n: int, rho: float) -> tuple[Floats, Floats]:
+def _trace_slope(t: Floats, c: Floats, n: int, rho: float | Floats) -> tuple[Floats, Floats]:
     """First and second derivative of -trace M^-1, over trace M^-1."""
-    if rho == 1.0:
+    if is_one(rho):
         first, second = _log_ratio(t, c)
         return -first, -second
     s, ds, dds, r, dr, ddr = _share(t, rho)
@@ -247,10 +257,10 @@ def _log_ratio(t: Floats, c: Floats) -> tuple[Floats, Floats]:
     return first, dda / a - 2.0 * first * v - ddf / f
 
 
-Slope = Callable[[Floats, Floats, int, float], tuple[Floats, Floats]]
+Slope = Callable[[Floats, Floats, int, float | Floats], tuple[Floats, Floats]]
 
 
-def _newton(slope: Slope, c: Floats, n: int, rho: float, ends: tuple[Floats, ...] = ()) -> Floats:
+def _newton(slope: Slope, c: Floats, n: int, rho: float | Floats, ends: tuple[Floats, ...] = ()) -> Floats:
     """Where in [0, 1] a falling slope passes zero; the better end if nowhere, a half if it is flat.
 
     `c` (degree + 1, k, B): coefficients of the polynomials; `ends`: the slope at 0 and 1 where it is known.
@@ -281,6 +291,7 @@ def _newton(slope: Slope, c: Floats, n: int, rho: float, ends: tuple[Floats, ...
                 break
             at = np.flatnonzero(busy)
             todo, t, lo, hi, c, busy = todo[at], t[at], lo[at], hi[at], c[..., at], busy[at]
+            rho = of_elements(rho, at)
         h, dh = slope(t, c, n, rho)
         rising = h > 0.0
         np.copyto(lo, t, where=rising)

@@ -10,7 +10,7 @@ __all__ = ["best_of_two"]
 
 
 def best_of_two(
-    criterion: str, M: Ends, inverses: Ends, dets: Ends, *, bump: Floats | None = None, rho: float = 1.0
+    criterion: str, M: Ends, inverses: Ends, dets: Ends, *, bump: Floats | None = None, rho: float | Floats = 1.0
 ) -> Floats:
     """Weights (t, 1 - t) (2, B); M and the rest as in `pairs.best_weight`."""
     if M[0].dtype == np.float64 and len(M[0]) <= pairs.LIMIT:
