@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints
+from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
@@ -47,7 +48,7 @@ def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, jour
     influence = np.where(tracks.link != NO_TRACK, 0.0, np.nan)
     used = linked if config.memory == "restart" else linked & (tracks.time > tracks.used)
     chosen = np.flatnonzero(used)
-    mean, covariance = picture.mean.copy(), picture.covariance.copy()
+    mean, covariance, lineage = picture.mean.copy(), picture.covariance.copy(), picture.lineage.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
     done: list[Ints] = []
@@ -59,28 +60,49 @@ def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, jour
             one[:, several], spread[:, :, several] = parts.moments()
             mixed.append((at[several], parts))
         if config.memory == "recursive":
-            old = np.flatnonzero(picture.time[at] >= 0)
-            _remember(one, spread, gains, picture, at, old, config)
+            old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
+            for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
+                _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound)
         mean[:, at], covariance[:, :, at], state_time[at] = one, spread, time
+        lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory != "restart")
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
-    picture = replace(picture, mean=mean, covariance=covariance, time=state_time)
+    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage)
     return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
 def _gaussian(rows: Rows, members: Ints, config: CentreConfig, journal: Journal) -> tuple[Floats, Floats, Floats]:
     means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
     covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
-    weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
-    fused = fuse_last(config.rule, means, covariances, weights, influence=True, **config.rule_options)
-    one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+    related = kinship.is_related(rows, members) & (config.rule not in kinship.ANY_CORRELATION)
+    if related.all():
+        one, spread, gains = _of_kin(rows, members, means, covariances, config)
+    else:
+        weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
+        fused = fuse_last(config.rule, means, covariances, weights, influence=True, **config.rule_options)
+        one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+        if related.any():
+            some = _of_kin(rows, members[related], means[..., related], covariances[..., related], config)
+            one[:, related], spread[:, :, related], gains[:, related] = some
     bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
     if bad.any():
         one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
         gains[:, bad] = 1.0 / len(means)
         journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
     return one, spread, gains
+
+
+def _of_kin(
+    rows: Rows, members: Ints, means: Floats, covariances: Floats, config: CentreConfig
+) -> tuple[Floats, Floats, Floats]:
+    """Groups whose rows have data in common (see `kinship`)."""
+
+    def by_rule(means: Floats, covariances: Floats, which: list[int]) -> kinship.Estimates:
+        fused = fuse_last(config.rule, means, covariances, None, influence=True, **config.rule_options)
+        return kinship.Estimates(fused.mean, fused.covariance, np.nan_to_num(_influence(fused)))
+
+    return kinship.fuse_related(means, covariances, kinship.common(rows, members), by_rule)
 
 
 def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtures | None, NDArray[np.bool_]]:
@@ -91,6 +113,8 @@ def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtu
     if components is None or config.memory == "recursive" or (config.mixture_rule == "moments" and not alone):
         return None, several
     several = (components[members] > 1).any(axis=1)
+    if config.mixture_rule not in kinship.ANY_CORRELATION:
+        several &= ~kinship.is_related(rows, members)
     if not several.any():
         return None, several
     sources = [rows.tracks.mixtures(members[several, j]) for j in range(members.shape[1])]
@@ -121,10 +145,8 @@ def _shares(rows: Rows, members: Ints) -> Floats:
     return np.where(total > 0, r / np.where(total > 0, total, 1.0), 1.0 / len(r))
 
 
-def _remember(
-    one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, config: CentreConfig
-) -> None:
-    """Fuse the result of the local tracks with the predicted last one, where there is one."""
+def _remember(one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, bound: float) -> None:
+    """Fuse the result of the local tracks `old` with the predicted last one, under a bound on their correlation."""
     if not len(old):
         return
     again = fuse_last(
@@ -132,7 +154,7 @@ def _remember(
         np.stack([one[:, old], picture.mean[:, at[old]]]),
         np.stack([spread[:, :, old], picture.covariance[:, :, at[old]]]),
         influence=True,
-        max_correlation=config.memory_correlation,
+        max_correlation=bound,
     )
     good = linalg.is_positive_definite(again.covariance) & np.isfinite(again.mean).all(axis=0)
     kept = old[good]

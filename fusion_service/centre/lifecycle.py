@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre.lineage import NOBODY
 from fusion_service.centre.sources import as_mixtures, join_tracks, no_parts
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
@@ -33,7 +34,8 @@ class Picture:
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
     overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
-    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of.
+    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; lineage i32 code of the sources
+    whose data are in the density (-1: not known).
     """
 
     id: NDArray[np.uint64]
@@ -54,6 +56,7 @@ class Picture:
     existence: NDArray[np.float64]
     opinion: NDArray[np.float64]
     evidence: NDArray[np.float64]
+    lineage: NDArray[np.int32]
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
@@ -101,6 +104,7 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
         existence=np.ones(count),
         opinion=np.full(count, np.nan),
         evidence=np.zeros(count),
+        lineage=np.full(count, NOBODY, dtype=np.int32),
     )
 
 
