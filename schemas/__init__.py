@@ -2,7 +2,18 @@
 
 from schemas.codec import MAX_BYTES, VERSION, decode, digest, encode
 from schemas.errors import REASONS, FusionError, MessageError
-from schemas.keys import REALM, Key, check_name, check_realm, global_key, local_key, parse_key, truth_key
+from schemas.keys import (
+    REALM,
+    Key,
+    centre_source,
+    check_name,
+    check_realm,
+    check_source,
+    global_key,
+    local_key,
+    parse_key,
+    truth_key,
+)
 from schemas.messages import (
     DECISIONS,
     ORIGINS,
@@ -70,9 +81,11 @@ __all__ = [
     "Status",
     "StepLog",
     "Truth",
+    "centre_source",
     "check_name",
     "check_numbers",
     "check_realm",
+    "check_source",
     "check_space",
     "decode",
     "digest",

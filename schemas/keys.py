@@ -10,11 +10,23 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 
-__all__ = ["REALM", "Key", "check_name", "check_realm", "global_key", "local_key", "parse_key", "truth_key"]
+__all__ = [
+    "REALM",
+    "Key",
+    "centre_source",
+    "check_name",
+    "check_realm",
+    "check_source",
+    "global_key",
+    "local_key",
+    "parse_key",
+    "truth_key",
+]
 
 REALM = "fusion"
 VERSION = "v1"
 LOCAL = ("tracks", "intensity", "info", "alive")
+CENTRES = "global/"
 GLOBAL = ("tracks", "log", "status", "alive", "picture", "orders")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}\Z")
 
@@ -28,12 +40,29 @@ class Key:
     name: str
     what: str
 
+    @property
+    def source(self) -> str:
+        """The name of the source that it is a key of."""
+        return centre_source(self.name) if self.scope == "global" else self.name
+
 
 def check_name(name: str) -> str:
     """Return `name` if it can stand in a key: 1 to 64 letters, digits, `_.:-`, beginning with a letter or digit.
     Raises ValueError if not."""
     if not _NAME.match(name):
         raise ValueError(f"bad name {name!r}: use 1 to 64 letters, digits or _ . : - and begin with a letter or digit")
+    return name
+
+
+def centre_source(centre: str) -> str:
+    """The name under which the picture of a centre is a source of another one: `global/{centre}`."""
+    return f"{CENTRES}{centre}"
+
+
+def check_source(name: str) -> str:
+    """Return `name` if it can be that of a source: a name, or that of a centre as `centre_source` gives it. Raises
+    ValueError if not."""
+    check_name(name.removeprefix(CENTRES) if isinstance(name, str) else name)
     return name
 
 

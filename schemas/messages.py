@@ -93,6 +93,9 @@ class Header:
     source: the name in the key (a centre's name for what a centre publishes). epoch: when this run of the
     source began, ns. seq: +1 per message of one type within an epoch. sent: when it was sent, ns.
     origin: one of `ORIGINS`. lineage: the sources whose data it contains; None means `source` alone.
+
+    The bits of track_lineage (T, ceil(L/8)) u8, in tracks of both kinds, say which of the L names of `lineage` each
+    track contains: name k is bit k % 8 of byte k // 8; None means all of them.
     """
 
     type: ClassVar[str]
@@ -129,6 +132,7 @@ class LocalTracks(Header):
     identity: tuple[str | None, ...] | None = None
     kind: tuple[str | None, ...] | None = None
     kind_p: Floats | None = None
+    track_lineage: U8 | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -215,6 +219,7 @@ class GlobalTracks(Header):
     marks: U8 | None = None
     number: U32 | None = None
     callsign: tuple[str | None, ...] | None = None
+    track_lineage: U8 | None = None
 
 
 @dataclass(frozen=True, slots=True)

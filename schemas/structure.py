@@ -88,10 +88,23 @@ def _components(values: Values, tracks: int) -> int:
     return total
 
 
+def _lineages(values: Values, tracks: int) -> None:
+    """Which names of the lineage each track has, a row of bits for each."""
+    bits, lineage = values["track_lineage"], values["lineage"]
+    if bits is None:
+        return
+    if lineage is None:
+        raise MessageError("missing", "track_lineage without lineage")
+    width = -(-len(lineage) // 8)
+    _lengths(values, tracks * width, "track_lineage")
+    values["track_lineage"] = bits.reshape(tracks, width)
+
+
 def _local(values: Values) -> None:
     ids = values["ids"]
     _unique(ids)
     _lengths(values, len(ids), "existence", "updated", "identity", "kind", "kind_p")
+    _lineages(values, len(ids))
     _densities(values, _components(values, len(ids)))
 
 
@@ -131,6 +144,7 @@ def _global(values: Values) -> None:
         raise MessageError("bad-field", f"status: beyond {len(STATUSES) - 1}")
     if values["track_origin"] is not None and tracks and values["track_origin"].max() >= len(ORIGINS):
         raise MessageError("bad-field", f"track_origin: beyond {len(ORIGINS) - 1}")
+    _lineages(values, tracks)
     _densities(values, _components(values, tracks))
 
 

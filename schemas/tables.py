@@ -53,6 +53,7 @@ def _covariances(key: str, slot: str, ndim: int, optional: bool = False) -> Fiel
 
 
 _NAMES = values.list_of(values.name)
+_SOURCES = values.list_of(values.source)
 _TEXTS = values.list_of(values.maybe(values.text))
 _COUNTERS = values.map_of(values.u64)
 _FLOATS = values.map_of(values.number)
@@ -79,6 +80,7 @@ _IDS = _column("ids", "<u8")
 _MEANS = _column("means", "<f8", ndim=2)
 _DENSITIES = (_MEANS, _covariances("covs", "covariances", 3))
 _MIXED = (_column("counts", "<u2", optional=True), _column("weights", "<f8", optional=True))
+_LINEAGES = _column("track_lineage", "u1", optional=True, ndim=2)
 
 DECISION_COLUMNS = {
     "kind": "u1",
@@ -105,6 +107,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("identity", _TEXTS, list, optional=True),
         _plain("kind", _TEXTS, list, optional=True),
         _column("kind_p", "<f8", optional=True),
+        _LINEAGES,
     ),
     LocalIntensity: (*_HEADER, _TIME, *_WHERE, _HEIGHT, _column("weights", "<f8"), *_DENSITIES),
     SensorInfo: (
@@ -133,7 +136,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         *_MIXED,
         *_DENSITIES,
         _column("updated", "<i8"),
-        _plain("sources", _NAMES, list),
+        _plain("sources", _SOURCES, list),
         _column("contributor_counts", "<u2"),
         _column("contributor_source", "<u2"),
         _column("contributor_epoch", "<u8"),
@@ -151,6 +154,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _column("marks", "u1", optional=True),
         _column("number", "<u4", optional=True),
         _plain("callsign", _TEXTS, list, optional=True),
+        _LINEAGES,
     ),
     StepLog: (
         *_HEADER,
@@ -162,7 +166,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("refused", _ENTRIES, values.pack_entries),
         _plain("dropped", _ENTRIES, values.pack_entries),
         _plain("events", values.list_of(values.free_map), list),
-        _plain("sources", _NAMES, list),
+        _plain("sources", _SOURCES, list),
         *(_column(f"decision_{key}", dtype, path=f"decisions.{key}") for key, dtype in DECISION_COLUMNS.items()),
     ),
     Status: (

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from schemas.keys import check_name
+from schemas.keys import check_name, check_source
 from schemas.messages import ORIGINS, Entry, Floats
 from schemas.spaces import (
     MOTIONS,
@@ -97,6 +97,7 @@ nanoseconds = whole(0, 2**63 - 1)
 text = exactly(str, "a text")
 boolean = exactly(bool, "true or false")
 name = lru_cache(maxsize=4096)(check_name)
+source = lru_cache(maxsize=4096)(check_source)
 
 
 def number(value: Any) -> float:

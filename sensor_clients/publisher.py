@@ -202,6 +202,7 @@ class TrackPublisher(_MessagePublisher):
         identity: Sequence[str | None] | None = None,
         kind: Sequence[str | None] | None = None,
         kind_p: ArrayLike | None = None,
+        lineages: Sequence[Sequence[str]] | None = None,
     ) -> LocalTracks:
         """Publish T tracks that hold at `time` (ns UTC), as Gaussians or mixtures of C components in all.
 
@@ -209,7 +210,8 @@ class TrackPublisher(_MessagePublisher):
         component per track unless `counts` (T,) says how many, with `weights` (C,) summing to 1 per track.
         complete: this is all the source has, an id that is not listed is gone (T = 0 is then valid).
         Optional per track: existence in [0, 1], updated (time of the last measurement, ns), identity
-        ("mmsi:...", "icao:..."), kind and kind_p; height: where a two-dimensional source's tracks are.
+        ("mmsi:...", "icao:..."), kind and kind_p; lineages: of the publisher's lineage the names whose data are in each
+        track; height: where a two-dimensional source's tracks are.
         Arrays may be anything NumPy can read. `MessageError` names the track that is unsound.
         """
         names = _space(space)
@@ -228,6 +230,7 @@ class TrackPublisher(_MessagePublisher):
             "identity": None if identity is None else tuple(identity),
             "kind": None if kind is None else tuple(kind),
             "kind_p": _maybe(_floats, "kind_p", kind_p, (None,)),
+            "track_lineage": None if lineages is None else _bits(lineages, self._lineage or ()),
         }
         return self._send(LocalTracks, local_key(self.source, "tracks", self.realm), 8, parts)
 
@@ -276,6 +279,19 @@ class TruthPublisher(_MessagePublisher):
 
 def _maybe(convert: Callable[..., Any], name: str, value: Any, *options: Any) -> Any:
     return None if value is None else convert(name, value, *options)
+
+
+def _bits(lineages: Sequence[Sequence[str]], whole: Sequence[str]) -> NDArray[np.uint8]:
+    """Which names of the whole lineage are in each track (T, ceil(L/8))."""
+    place = {name: at for at, name in enumerate(whole)}
+    bits = np.zeros((len(lineages), len(whole)), dtype=np.bool_)
+    for row, names in enumerate(lineages):
+        unknown = [name for name in names if name not in place]
+        if unknown or not names:
+            known = ", ".join(whole) or "none"
+            raise MessageError("bad-field", f"lineages: {list(names)} of track {row} are not in the lineage ({known})")
+        bits[row, [place[name] for name in names]] = True
+    return np.packbits(bits, axis=1, bitorder="little")
 
 
 def _floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:

@@ -9,6 +9,7 @@ from fusion_service.centre.intake import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.intensity import IntensityCentre
 from fusion_service.centre.judging import Outcome, View, judge
 from fusion_service.centre.making import make_centre
+from fusion_service.centre.pictures import is_picture_of, source_of
 from fusion_service.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
 
 __all__ = [
@@ -31,8 +32,10 @@ __all__ = [
     "StepResult",
     "View",
     "WallClock",
+    "is_picture_of",
     "judge",
     "make_centre",
     "order_of",
     "read_order",
+    "source_of",
 ]

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats
+from fusion_service.centre import kinship
 from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.retiring import leave_out, retire
@@ -65,16 +66,19 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     if not parts:
         parts.append(intake.nothing())
     tracks = join_tracks(parts)
+    whose = _joined(index, np.intp)
+    kin = kinship.of_rows(intake, tracks, whose)
     return Rows(
-        source=_joined(index, np.intp),
+        source=whose,
         epoch=_joined(epochs, np.uint64),
         tracks=tracks,
-        may_start=_joined(starts, np.bool_),
+        may_start=_joined(starts, np.bool_) & ~kinship.stale_echo(tracks, kin.echo, time, config),
         interval=_joined(interval, np.int64),
         lost=_joined(lost, np.bool_),
         gate=_joined(gates, np.float64),
         fresh=tracks.updated > tracks.judged,
         kept=kept,
+        kin=kin,
     )
 
 

@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -121,6 +121,7 @@ class Centre(ABC):
         self._step += 1
         journal = self._journal
         self._obey(self._intake.take_orders(), time)
+        self._forget_lineages()
         self._intake.admit(time, self._time, journal)
         self._time = time
         if self._intake.reframed:
@@ -227,6 +228,16 @@ class Centre(ABC):
             self._journal.end(track, reason, None)
         self._forget(self._picture.id[gone].tolist())
         self._picture = self._picture.take(~gone)
+
+    def _forget_lineages(self) -> None:
+        """Let go the lineages that nothing has any more, where they are many."""
+        sources = self._intake.sources.values()
+        new = self._intake.lineages.compacted([self._picture.lineage, *(one.tracks.lineage for one in sources)])
+        if new is None:
+            return
+        self._picture = replace(self._picture, lineage=new[self._picture.lineage])
+        for source in sources:
+            source.tracks = replace(source.tracks, lineage=new[source.tracks.lineage])
 
     def _numbers(self) -> dict[str, int]:
         kinds = Counter(self._picture.status.tolist())

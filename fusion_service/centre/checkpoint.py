@@ -35,6 +35,7 @@ MISSING: dict[str, float] = {
     **dict.fromkeys(("since", "used", "judged", "weighed", "seen", "told", "last_hit", "due"), -1),
     "identity": -1,
     "motion": -1,
+    "lineage": -1,
     "kind": -1,
     "kind_p": np.nan,
 }
@@ -66,6 +67,7 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: 
         "orders": intake.orders.kept(),
         "labels": labels.kept(),
         "said": [words.texts for words in intake.said],
+        "lineages": intake.lineages.kept(),
         **state,
     }
     return cast(bytes, msgpack.packb(whole))
@@ -100,6 +102,7 @@ def unpack_state(blob: bytes, intake: Intake, labels: Labels) -> tuple[dict[str,
 
 def _restore_words(whole: dict[str, Any], sources: dict[str, Source], intake: Intake, labels: Labels) -> None:
     """What was ordered and said. In a checkpoint of an earlier release a muted source is all there is of orders."""
+    intake.lineages.restore(whole.get("lineages", {"names": [], "sets": []}))
     intake.said = Lexicon(*(Words(texts) for texts in whole.get("said", [[], []])))
     if "labels" in whole:
         labels.restore(whole["labels"])

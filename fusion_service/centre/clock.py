@@ -5,8 +5,9 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass
 
+from fusion_service.centre.pictures import is_picture_of, source_of
 from fusion_service.config import CentreConfig
-from schemas import LocalIntensity, LocalTracks
+from schemas import GlobalTracks, LocalIntensity, LocalTracks
 
 __all__ = ["MessageClock", "WallClock", "horizon"]
 
@@ -50,6 +51,7 @@ class _Source:
     epoch: its run. claimed: the newest time it said in this run, and newest: that of those which were followed.
     token: whether its token is there; None if it never had one. Of one too far ahead: refused, the newest time
     that was; waited, how long it has gone on by its own count while the median stood at `median`.
+    centre: it is another centre.
     """
 
     epoch: int = -1
@@ -59,6 +61,7 @@ class _Source:
     refused: int = -1
     waited: int = 0
     median: int = -1
+    centre: bool = False
 
 
 class MessageClock:
@@ -79,6 +82,9 @@ class MessageClock:
     What is too late for the newest step is for the centre to refuse, in the next step; but where nothing else comes
     there is none, so that it is refused at once (`observe`). Where that has gone on for the lead, time was set back
     for everybody, and steps begin again from there.
+
+    Other centres are waited for only where no other source is live: two that exchange their pictures would each wait
+    for the other.
 
     Spans without any message are skipped. At most `MAX_NAMES` sources are known: beyond, a tenth of them is
     forgotten, those without a token first, the longest silent among them.
@@ -107,13 +113,13 @@ class MessageClock:
         self._late_newest = -1
         self._late_waited = 0
 
-    def fault(self, message: LocalTracks | LocalIntensity, received: int) -> str:
+    def fault(self, message: LocalTracks | LocalIntensity | GlobalTracks, received: int) -> str:
         """Observe a message that came at `received`, ns, and say why to refuse it: `future`, too far ahead of its
         reception or of the others; `late`, when no step will be made that tells; empty: take it."""
         if max(message.time, message.epoch) > horizon(received, self._config):
             return "future"
         late = self._is_late(message.time)
-        return "" if self.observe(message.source, message.epoch, message.time) else "late" if late else "future"
+        return "" if self.observe(source_of(message), message.epoch, message.time) else "late" if late else "future"
 
     def observe(self, source: str, epoch: int, time: int) -> bool:
         """A message of this run of `source` holds at `time`, ns. False: refuse it, as too far ahead of the others, or
@@ -173,7 +179,7 @@ class MessageClock:
                 for known in heapq.nsmallest(self.MAX_NAMES // 10, unheld, key=lambda it: self._sources[it].newest):
                     del self._sources[known]
                 self._look_again()
-            self._sources[name] = _Source()
+            self._sources[name] = _Source(centre=bool(is_picture_of(name)))
         return self._sources[name]
 
     def _look_again(self) -> None:
@@ -223,8 +229,14 @@ class MessageClock:
 
     def _reached(self, time: int) -> bool:
         """Whether everybody who is waited for has said `time`."""
-        return all(
-            one.newest >= time or one.refused >= 0 or 0 <= one.newest < self._front - self._lead
-            for one in self._sources.values()
-            if self._is_live(one, one.newest)
-        )
+        centres = False
+        for one in self._sources.values():
+            if not self._is_live(one, one.newest):
+                continue
+            if one.newest >= time or one.refused >= 0 or 0 <= one.newest < self._front - self._lead:
+                continue
+            if not one.centre:
+                return False
+            centres = True
+        others = (one for one in self._sources.values() if not one.centre)
+        return not centres or any(self._is_live(one, one.newest) for one in others)

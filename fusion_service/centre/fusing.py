@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.correlation import Correlation
 from fusion_service.centre.journal import Journal
@@ -52,7 +53,7 @@ def fuse_all(
     linked = linked if left is None else linked & ~left
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
     chosen = np.flatnonzero(used)
-    mean, covariance = picture.mean.copy(), picture.covariance.copy()
+    mean, covariance, lineage = picture.mean.copy(), picture.covariance.copy(), picture.lineage.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
     done: list[Ints] = []
@@ -64,13 +65,15 @@ def fuse_all(
             one[:, several], spread[:, :, several] = parts.moments()
             mixed.append((at[several], parts))
         if config.memory == "recursive":
-            old = np.flatnonzero(picture.time[at] >= 0)
-            _remember(one, spread, gains, picture, at, old, config)
+            old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
+            for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
+                _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound)
         mean[:, at], covariance[:, :, at], state_time[at] = one, spread, time
+        lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory != "restart")
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
-    picture = replace(picture, mean=mean, covariance=covariance, time=state_time)
+    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage)
     return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
@@ -78,15 +81,34 @@ def _gaussian(rows: Rows, members: Ints, known: Correlation, journal: Journal) -
     config = known.config
     means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
     covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
-    weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
-    fused = known.fuse(rows, members, means, covariances, weights)
-    one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+    related = kinship.is_related(rows, members) & (config.rule not in kinship.ANY_CORRELATION)
+    if related.all():
+        one, spread, gains = _of_kin(rows, members, means, covariances, known)
+    else:
+        weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
+        fused = known.fuse(rows, members, means, covariances, weights)
+        one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+        if related.any():
+            some = _of_kin(rows, members[related], means[..., related], covariances[..., related], known)
+            one[:, related], spread[:, :, related], gains[:, related] = some
     bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
     if bad.any():
         one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
         gains[:, bad] = 1.0 / len(means)
         journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
     return one, spread, gains
+
+
+def _of_kin(
+    rows: Rows, members: Ints, means: Floats, covariances: Floats, known: Correlation
+) -> tuple[Floats, Floats, Floats]:
+    """Groups whose rows have data in common (see `kinship`)."""
+
+    def by_rule(means: Floats, covariances: Floats, which: list[int], some: Ints) -> kinship.Estimates:
+        fused = known.fuse(rows, members[some][:, which], means, covariances, None)
+        return kinship.Estimates(fused.mean, fused.covariance, np.nan_to_num(_influence(fused)))
+
+    return kinship.fuse_related(means, covariances, kinship.common(rows, members), by_rule)
 
 
 def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtures | None, NDArray[np.bool_]]:
@@ -97,6 +119,8 @@ def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtu
     if components is None or config.memory == "recursive" or (config.mixture_rule == "moments" and not alone):
         return None, several
     several = (components[members] > 1).any(axis=1)
+    if config.mixture_rule not in kinship.ANY_CORRELATION:
+        several &= ~kinship.is_related(rows, members)
     if not several.any():
         return None, several
     sources = [rows.tracks.mixtures(members[several, j]) for j in range(members.shape[1])]
@@ -127,10 +151,8 @@ def _shares(rows: Rows, members: Ints) -> Floats:
     return np.where(total > 0, r / np.where(total > 0, total, 1.0), 1.0 / len(r))
 
 
-def _remember(
-    one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, config: CentreConfig
-) -> None:
-    """Fuse the result of the local tracks with the predicted last one, where there is one."""
+def _remember(one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, bound: float) -> None:
+    """Fuse the result of the local tracks `old` with the predicted last one, under a bound on their correlation."""
     if not len(old):
         return
     again = fuse_last(
@@ -138,7 +160,7 @@ def _remember(
         np.stack([one[:, old], picture.mean[:, at[old]]]),
         np.stack([spread[:, :, old], picture.covariance[:, :, at[old]]]),
         influence=True,
-        max_correlation=config.memory_correlation,
+        max_correlation=bound,
     )
     good = linalg.is_positive_definite(again.covariance) & np.isfinite(again.mean).all(axis=0)
     kept = old[good]

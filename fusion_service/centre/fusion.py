@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
 from fusion_service.centre.centre import Centre
 from fusion_service.centre.existence import Entries, update_existence
@@ -98,6 +99,7 @@ class FusionCentre(Centre):
     def _live(self, rows: Rows, time: int) -> None:
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()
         at = picture.find(tracks.link[inside])
+        rows = kinship.new_only(rows, picture.updated, at, inside)
         updated, newest = picture.updated.copy(), np.full(len(picture.id), -1, dtype=np.int64)
         np.maximum.at(updated, at, tracks.updated[inside])
         np.maximum.at(newest, at, tracks.time[inside])
@@ -120,7 +122,8 @@ class FusionCentre(Centre):
         due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
         np.maximum.at(due, at, expected)
         np.maximum.at(slowest, at, interval)
-        sources = np.bincount(at[expected >= time], minlength=count)
+        counted = kinship.separate(rows, inside)
+        sources = np.bincount(at[(expected >= time) & counted], minlength=count)
         hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
         linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
         return Support(sources, hit, due, slowest, linked == 0, self._last)

@@ -63,6 +63,8 @@ class Identities:
         says = (tracks.identity != NONE) | (tracks.kind != NONE)
         new = np.flatnonzero(says & (tracks.link != NO_TRACK) & ~tracks.outside & (tracks.updated > tracks.told))
         new = new[np.isin(tracks.link[new], ids)]
+        known = np.concatenate([self.identity.track, self.kind.track])
+        new = new[~rows.echo[new] | ~np.isin(tracks.link[new], known)]  # its own word is no news to a centre
         if len(new):
             self._hear(rows, new)
             tracks.told[new] = tracks.updated[new]

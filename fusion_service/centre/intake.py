@@ -24,7 +24,9 @@ from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
 from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.orders import Orders
+from fusion_service.centre.pictures import as_scan, is_own, is_picture_of, source_of
 from fusion_service.centre.scans import Scan, as_tracks, fits, is_sound, message_tracks, size_of
 from fusion_service.centre.sources import Source, Tracks, empty_tracks
 from fusion_service.centre.words import Lexicon, Words
@@ -35,14 +37,15 @@ from schemas import (
     FAULTS,
     Entry,
     Frame,
+    GlobalTracks,
     LocalIntensity,
     LocalTracks,
     Message,
     MessageError,
     Motion,
     SensorInfo,
-    check_name,
     check_numbers,
+    check_source,
     digest,
 )
 
@@ -102,6 +105,7 @@ class Intake:
         self._components = 0
         self.orders = Orders()
         self.said = Lexicon(Words(), Words())
+        self.lineages = Lineages()
         self._given: list[Order] = []
         self._present: dict[str, bool] = {}
         self._refused: Counter[tuple[str, str, bool]] = Counter()
@@ -121,15 +125,15 @@ class Intake:
         elif isinstance(event, (ClockSet, NewEra)):
             return
         elif self._is_full(event):
-            self._count(event.source, "pending", 1, dropped=True)
+            self._count(source_of(event), "pending", 1, dropped=True)
         else:
             self._queue.append((event, received))
-            self._held[event.source] += 1
+            self._held[source_of(event)] += 1
             self._components += size_of(event)
 
     def _is_full(self, message: Message) -> bool:
         full = len(self._queue) >= MAX_QUEUED or self._components + size_of(message) > MAX_COMPONENTS
-        return full or self._held[message.source] >= self.config.max_pending
+        return full or self._held[source_of(message)] >= self.config.max_pending
 
     def _count(self, source: str, reason: str, count: int, dropped: bool) -> None:
         key = (source, reason, dropped)
@@ -177,7 +181,8 @@ class Intake:
 
     def ready(self, source: Source) -> bool:
         """Whether its tracks may be used: it has said what it is, or had a step's time to do so."""
-        return source.info is not None or source.waited > 0 or self.config.source(source.name).override
+        known = source.info is not None or source.waited > 0 or self.config.source(source.name).override
+        return known or bool(is_picture_of(source.name))
 
     def is_stale(self, source: Source, time: int) -> bool:
         """Whether it has been silent for `stale_periods` of its own periods, measured or declared, and `lateness`."""
@@ -225,23 +230,22 @@ class Intake:
         self._held.clear()
         due: list[_Keyed] = []
         for event, received in queue:
-            later = isinstance(event, (LocalTracks, LocalIntensity)) and time < event.time <= horizon(
-                received, self.config
-            )
-            if later:
-                self._held[event.source] += 1
+            name = source_of(event)
+            timed = isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks))
+            if timed and time < getattr(event, "time", -1) <= horizon(received, self.config):
+                self._held[name] += 1
                 self._components += size_of(event)
                 self._queue.append((event, received))
-                if event.source in self.sources:
-                    source = self.sources[event.source]
+                if name in self.sources:
+                    source = self.sources[name]
                     source.ahead = max(source.ahead, getattr(event, "time", -1))
                 continue
             try:
-                key = (event.source, event.epoch, event.seq, event.type, digest(event), received)
+                key = (name, event.epoch, event.seq, event.type, digest(event), received)
             except MessageError as error:
-                journal.refuse(Entry(event.source, 0, 0, 0, error.reason))
+                journal.refuse(Entry(name, 0, 0, 0, error.reason))
             else:
-                due.append((key, event))
+                due.append((key, as_scan(event, self.config, self.frame)))
         due.sort(key=lambda item: item[0])
         return due
 
@@ -263,7 +267,7 @@ class Intake:
         if name in self.sources:
             return self.sources[name]
         try:
-            check_name(name)
+            check_source(name)
         except ValueError:
             return None
         if len(self.sources) >= MAX_SOURCES:
@@ -312,7 +316,7 @@ class Intake:
             return "muted"
         if message.origin not in self.config.source(source.name).allowed_origins:
             return "origin"
-        if self.config.name in (message.lineage or ()) or message.source == self.config.name:
+        if is_own(message, self.config):
             return "loop"
         holds = getattr(message, "time", -1)
         started = -1 if message.epoch == source.epoch else message.epoch
@@ -380,7 +384,8 @@ class Intake:
             try:
                 if self.frame is None:
                     raise FrameError(notes.unfit(name_frame(first.frame), self.config.space))
-                new = message_tracks(messages, sound, self.frame, said.height, self.config.max_components, self.said)
+                most, words = self.config.max_components, (self.said, self.lineages)
+                new = message_tracks(messages, sound, self.frame, said.height, most, *words)
                 new = loosened(new, first.space, said)
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))

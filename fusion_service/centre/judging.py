@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.sources import Tracks
 from fusion_service.order import ABOUT, WHAT, LocalId, Order
-from schemas import check_name
+from schemas import check_source
 
 __all__ = ["MOST_STANDING", "Outcome", "Seen", "Standing", "View", "find_local", "judge", "linked_to", "lives"]
 
@@ -223,7 +223,7 @@ def _identify(order: Order, view: View) -> str:
 
 def _mute(order: Order, view: View) -> str:
     try:
-        check_name(order.source)
+        check_source(order.source)
     except (ValueError, TypeError) as error:
         raise _No(str(error)) from None
     if number := _about(view, "mute", order.source):

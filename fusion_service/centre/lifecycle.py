@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre.lineage import NOBODY
 from fusion_service.centre.sources import as_mixtures, join_tracks, no_parts
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
@@ -36,8 +37,9 @@ class Picture:
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
     overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
-    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; motion i32 code (see `motions`);
-    way u8 index into `WAYS` of what it was last fused by.
+    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; lineage i32 code of the sources
+    whose data are in the density (-1: not known); motion i32 code (see `motions`); way u8 index into `WAYS` of what
+    it was last fused by.
     """
 
     id: NDArray[np.uint64]
@@ -60,6 +62,7 @@ class Picture:
     evidence: NDArray[np.float64]
     motion: NDArray[np.int32]
     way: NDArray[np.uint8]
+    lineage: NDArray[np.int32]
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
@@ -109,6 +112,7 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
         evidence=np.zeros(count),
         motion=np.full(count, -1, dtype=np.int32),
         way=np.zeros(count, dtype=np.uint8),
+        lineage=np.full(count, NOBODY, dtype=np.int32),
     )
 
 

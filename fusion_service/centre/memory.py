@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.centre import kinship
+from fusion_service.centre.association import by_size
 from fusion_service.centre.correlation import declared_correlation
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.increments import Increments, increments
@@ -74,14 +76,14 @@ class Memory:
         sources = np.array([not self.watch.records[name].reason for name in names], dtype=np.bool_)
         parts = rows.tracks.log_weight
         several = np.isfinite(parts).sum(axis=0) > 1 if len(parts) else np.zeros(len(rows.source), dtype=np.bool_)
-        return sources[rows.source] & ~several
+        return sources[rows.source] & ~several & kinship.alone(self._intake, rows)
 
     def _filter(
         self, rows: Rows, names: tuple[str, ...], before: Picture, picture: Picture, influence: Floats, at: Ints,
         capable: Bools, filtered: Bools, ruled: Bools, step: int, time: int,
     ) -> Picture:  # fmt: skip
         """Run the filters of the tracks `filtered`, and write the influences of their rows."""
-        tracks, config = rows.tracks, self._config
+        tracks = rows.tracks
         self.filters.rename(names)
         base = self.filters.bases(before)
         versions = versions_of(self._intake, rows)
@@ -100,7 +102,7 @@ class Memory:
         some = np.flatnonzero(filtered[:-1])
         cut = self._cut(rows, names, at, len(picture.id), time)[some]
         which = np.searchsorted(picture.id[some], operations.track)
-        states, bases, share = run(base.take(some), which, operations, cut, time, self.motions, config)
+        states, bases, share = run(base.take(some), which, operations, cut, time, self.motions)
         fresh = operations.row >= 0
         np.add.at(influence, operations.row[fresh], share[fresh])
         tracks.used[filtered[at]] = tracks.time[filtered[at]]
@@ -108,8 +110,13 @@ class Memory:
         self._keep(picture, bases, some, open_, ruled)
         mean, covariance, when = picture.mean.copy(), picture.covariance.copy(), picture.time.copy()
         mean[:, some], covariance[:, :, some], when[some] = states.mean, states.covariance, time
+        lineage = picture.lineage.copy()
+        fed = np.flatnonzero(filtered[at])
+        for ids, groups in by_size(tracks.link[fed]):
+            there = picture.find(ids)
+            lineage[there] = kinship.inherited(rows, fed[groups], lineage[there], memory=True)
         way = np.where(filtered[:-1], 1, np.where(ruled, 0, picture.way)).astype(np.uint8)
-        return replace(picture, mean=mean, covariance=covariance, time=when, way=way)
+        return replace(picture, mean=mean, covariance=covariance, time=when, lineage=lineage, way=way)
 
     def _note(self, rows: Rows, names: tuple[str, ...], row: Ints, found: Increments, taken: Bools) -> None:
         """Let the watch see the versions that count: of sources that declare what it takes, and Gaussian."""

@@ -12,12 +12,16 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import Picture, Support, advance
+from fusion_service.centre.pictures import is_picture_of
 from fusion_service.config import CentreConfig
 from fusion_service.coverage import region_holds
 from fusion_service.densities import Mixtures
 from schemas import ORIGINS, STATUSES, GlobalTracks, Local, messages
 
 __all__ = ["Contributions", "live_on", "picture_message"]
+
+MOST_BITS = 2**21
+"""Bytes of lineages of tracks that a message carries at most."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,7 +62,8 @@ def picture_message(
     time: int,
     rule: str,
 ) -> GlobalTracks:
-    """The message that publishes a picture; its lineage is every source known and the centre itself."""
+    """The message that publishes a picture; its lineage is every source known, what is in the tracks, and the centre
+    itself."""
     config, names = intake.config, intake.names()
     picture, contributions = _published(picture, contributions, intake)
     origins = {source.origin for source in intake.sources.values() if source.messages}
@@ -69,7 +74,7 @@ def picture_message(
         seq=seq,
         sent=time,
         origin=origin,
-        lineage=(*(name for name in names if name != config.name), config.name),
+        **_lineage(picture, intake),
         time=time,
         step=step,
         rule=rule,
@@ -110,6 +115,15 @@ def _published(picture: Picture, contributions: Contributions, intake: Intake) -
         influence=contributions.influence[whose],
     )
     return picture.take(shown), kept
+
+
+def _lineage(picture: Picture, intake: Intake) -> dict[str, Any]:
+    """The lineage of a message and, of a centre that links tracks, that of each of them; too many bits are left out."""
+    own, names = intake.config.name, [name for name in intake.names() if not is_picture_of(name)]
+    if intake.config.kind != "tracks":
+        return {"lineage": (*(name for name in names if name != own), own)}
+    lineage, bits = intake.lineages.told(picture.lineage, names, own)
+    return {"lineage": lineage, "track_lineage": bits if bits.size <= MOST_BITS else None}
 
 
 def _densities(picture: Picture, publish: str) -> dict[str, Any]:

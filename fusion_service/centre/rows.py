@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre.lineage import Kin
 from fusion_service.centre.sources import Tracks
 
 __all__ = ["NO_TRACK", "Rows"]
@@ -23,7 +24,7 @@ class Rows:
     (n, n, M) predicted and marginalised to the centre's space; the columns of links may be written. may_start
     (M,). interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. gate
     (M,): d2 within which it may join or begin a track. fresh (M,): a measurement is in it that was not judged before.
-    kept: how many of them each source has, in order.
+    kept: how many of them each source has, in order. kin: whose data is in each, None where that is not known.
     """
 
     source: NDArray[np.intp]
@@ -35,6 +36,12 @@ class Rows:
     gate: NDArray[np.float64]
     fresh: NDArray[np.bool_]
     kept: dict[str, int]
+    kin: Kin | None = None
+
+    @property
+    def echo(self) -> NDArray[np.bool_]:
+        """(M,): there are data of this centre in it."""
+        return np.zeros(len(self.source), dtype=np.bool_) if self.kin is None else self.kin.echo
 
     def linked(self) -> NDArray[np.intp]:
         """Rows that belong to a global track."""

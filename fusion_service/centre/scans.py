@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from fusion_service import geodesy, linalg
 from fusion_service.arrays import Floats
+from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.sources import Tracks, no_parts, unlinked
 from fusion_service.centre.words import Lexicon
 from fusion_service.densities import Mixtures, reduce_mixtures
-from schemas import FAULTS, ORIGINS, Frame, Height, LocalIntensity, LocalTracks, Message, SensorInfo
+from schemas import FAULTS, ORIGINS, Frame, GlobalTracks, Height, LocalIntensity, LocalTracks, Message, SensorInfo
 
 __all__ = ["MAX_PERIOD", "Scan", "as_tracks", "fits", "is_sound", "message_tracks", "size_of"]
 
@@ -28,7 +29,7 @@ Scan: TypeAlias = LocalTracks | LocalIntensity
 
 def size_of(message: Message) -> int:
     """How many components it has."""
-    return len(message.means) if isinstance(message, (LocalTracks, LocalIntensity)) else 1
+    return len(message.means) if isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)) else 1
 
 
 def as_tracks(message: Scan, faults: NDArray[np.uint8]) -> LocalTracks:
@@ -67,8 +68,14 @@ def fits(message: Scan) -> bool:
         and message.covariances.shape == (total, n, n)
         and all(column is None or len(column) == tracks for column in lengths)
         and (message.weights is None or len(message.weights) == total)
+        and _bits_fit(message)
         and {*map(type, texts)} <= {str, type(None)}
     )
+
+
+def _bits_fit(message: LocalTracks) -> bool:
+    shape = len(message.ids), -(-len(message.lineage or ()) // 8)
+    return message.track_lineage is None or message.track_lineage.shape == shape
 
 
 def is_sound(info: SensorInfo) -> bool:
@@ -89,9 +96,11 @@ def message_tracks(
     height: Height | None,
     most: int,
     said: Lexicon,
+    lineages: Lineages,
 ) -> Tracks:
     """The sound tracks of messages of one space, frame and height, in `frame`, one after the other; mixtures of
-    more than `most` components are reduced. said: gives texts their codes.
+    more than `most` components are reduced. said, lineages: give texts and
+    lineages their codes.
 
     Raises `geodesy.FrameError` where their frame cannot be brought into `frame`.
     """
@@ -124,13 +133,14 @@ def message_tracks(
         existence=_gather(existence, sound).astype(np.float64),
         updated=np.minimum(_gather(updated, sound), times),
         interval=np.zeros(len(times), dtype=np.int64),
-        **_told(messages, sound, counts, said),
+        **_told(messages, sound, said),
+        lineage=_gather([lineages.of_message(m) for m in messages], sound),
         **unlinked(len(times)),
     )
 
 
 def _told(
-    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], counts: list[int], said: Lexicon
+    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], said: Lexicon
 ) -> dict[str, NDArray[Any]]:
     """The columns of what the tracks are said to be, and of their origin."""
     nothing = [np.full(len(m.ids), -1, dtype=np.int32) for m in messages]
@@ -139,12 +149,16 @@ def _told(
         for words, column in ((said.identity, [m.identity for m in messages]), (said.kind, [m.kind for m in messages]))
     )
     sure = [np.full(len(m.ids), np.nan) if m.kind_p is None else m.kind_p for m in messages]
-    origins = np.array([ORIGINS.index(m.origin) for m in messages], dtype=np.uint8)
+    own = [getattr(m, "track_origin", None) for m in messages]
+    origins = [
+        np.full(len(m.ids), ORIGINS.index(m.origin), dtype=np.uint8) if column is None else column
+        for m, column in zip(messages, own, strict=True)
+    ]
     return {
         "identity": _gather(identity, sound),
         "kind": _gather(kind, sound),
         "kind_p": _gather(sure, sound).astype(np.float64),
-        "origin": np.repeat(origins, counts),
+        "origin": _gather(origins, sound),
     }
 
 

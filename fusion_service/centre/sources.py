@@ -77,7 +77,8 @@ class Tracks:
     i64 `updated` of the newest datum that was judged, seen i64 time of the step that did; weighed i64 newest datum of
     the others in the track when evidence was last added; data i64 how many were judged in this link; evidence f64 sum
     for the link; outside: the newest datum failed its gate; shadow u64 global id that it is a second track of, or 0;
-    apart f64 sum for that; told i64 `updated` of the version whose identity and class the global track has heard.
+    apart f64 sum for that; told i64 `updated` of the version whose identity and class the global track has heard;
+    lineage i32 code of the sources whose data it contains (-1: its source alone).
     """
 
     id: NDArray[np.uint64]
@@ -94,6 +95,7 @@ class Tracks:
     kind: Codes
     kind_p: NDArray[np.float64]
     origin: NDArray[np.uint8]
+    lineage: NDArray[np.int32]
     link: NDArray[np.uint64]
     since: NDArray[np.int64]
     used: NDArray[np.int64]
@@ -155,6 +157,7 @@ def empty_tracks(n: int) -> Tracks:
         kind=code,
         kind_p=real,
         origin=np.zeros(0, dtype=np.uint8),
+        lineage=code,
         **unlinked(0),
     )
 

@@ -23,7 +23,6 @@ from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints, from_bytes, to_bytes
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.motions import Motions, States
-from fusion_service.config import CentreConfig
 from fusion_service.rules import fuse_last
 
 __all__ = ["Filters", "Operations", "run"]
@@ -132,8 +131,7 @@ class Filters:
 
 
 def run(
-    base: States, at: Ints, operations: Operations, cut: NDArray[np.int64], time: int, motions: Motions,
-    config: CentreConfig,
+    base: States, at: Ints, operations: Operations, cut: NDArray[np.int64], time: int, motions: Motions
 ) -> tuple[States, States, Floats]:  # fmt: skip
     """Every filter's state at `time`, ns, its base for the next step, that is after all operations up to `cut` (G,),
     and the share (K,) of each operation: trace(K)/n of its gain.
@@ -153,7 +151,7 @@ def run(
             some = np.flatnonzero(turn == number)
             which = at[first[some]]
             state = _at(now.take(which), operations.time[first[some]], motions)
-            state = _updated(state, first[some], size[some], operations, share, config)
+            state = _updated(state, first[some], size[some], operations, share)
             _put(now, which, state)
             done = operations.time[first[some]] <= cut[which]
             _put(kept, which[done], state.take(done))
@@ -172,7 +170,11 @@ def _at(states: States, time: NDArray[np.int64], motions: Motions) -> States:
 
 
 def _updated(
-    states: States, first: Ints, size: Ints, operations: Operations, share: Floats, config: CentreConfig
+    states: States,
+    first: Ints,
+    size: Ints,
+    operations: Operations,
+    share: Floats,
 ) -> States:
     """States after operations of one time: those of state k are the `size[k]` from `first[k]` on, increments before
     whole estimates. Writes the shares."""
@@ -201,21 +203,19 @@ def _updated(
         share[which[~whole]] = linalg.inner(covariance[:, :, inside], operations.matrix[:, :, which[~whole]]) / n
         some, which = some[whole], which[whole]
         if len(some):
-            _intersect(mean, covariance, some, which, operations, share, config)
+            _intersect(mean, covariance, some, which, operations, share)
     return replace(states, mean=mean, covariance=covariance)
 
 
 def _intersect(
     mean: Floats, covariance: Floats, some: Ints, which: Ints, operations: Operations, share: Floats,
-    config: CentreConfig,
 ) -> None:  # fmt: skip
-    """Fuse the states `some` with the whole estimates `which`, under the bound of the config."""
+    """Fuse the states `some` with the whole estimates `which`, whatever they share."""
     fused = fuse_last(
-        "bci",
+        "ci",
         np.stack([mean[:, some], operations.mean[:, which]]),
         np.stack([covariance[:, :, some], operations.matrix[:, :, which]]),
         influence=True,
-        max_correlation=config.memory_correlation,
     )
     good = linalg.is_positive_definite(fused.covariance) & np.isfinite(fused.mean).all(axis=0)
     at = some[good]

@@ -185,7 +185,7 @@ class CentreConfig:
     max_pending: int = _setting(10_000, whole(1, 10_000_000), "messages held per source for later steps")
     fuse_origins: bool = _setting(False, flag, "fuse live, exercise, simulated and replayed data together")
     source_defaults: SourceConfig = _setting(SourceConfig(), lambda v: v, "for every source")
-    sources: dict[str, SourceConfig] = _setting({}, table, "by name, over the defaults")
+    sources: dict[str, SourceConfig] = _setting({}, table, "by name, over the defaults; global/NAME: a centre")
 
     @property
     def follows(self) -> bool:

@@ -21,7 +21,7 @@ from fusion_service.config.config import (
 )
 from fusion_service.config.correlation import tried
 from fusion_service.config.toml_text import dotted, key_lines, line_of
-from schemas import Ecef, check_name
+from schemas import Ecef, Motion, centre_source, check_source
 
 __all__ = ["centre_config", "load_config"]
 
@@ -98,7 +98,11 @@ def _read_centre(raw: Any, where: tuple[str, ...], problems: Problems) -> Centre
     defaults = (
         given if isinstance(given, SourceConfig) else _read(SourceConfig, given, (*where, "source_defaults"), problems)
     )
-    sources = _read_sources(raw.get("sources", {}), (*where, "sources"), defaults, problems)
+    sources = _read_sources(
+        raw.get("sources", {}), (*where, "sources"), defaults, config.motion or defaults.motion, problems
+    )
+    if centre_source(config.name) in sources:
+        problems.append(((*where, "sources", centre_source(config.name)), "is this centre itself: name another one"))
     problems.extend(((*where, key), what) for key, what in _contradictions(config))
     wrong = {key[len(where)] for key, _ in problems if key[: len(where)] == where and len(key) > len(where)}
     if not wrong & {"rule", "rule_options", "space"}:
@@ -108,7 +112,7 @@ def _read_centre(raw: Any, where: tuple[str, ...], problems: Problems) -> Centre
 
 
 def _read_sources(
-    table: Any, where: tuple[str, ...], defaults: SourceConfig, problems: Problems
+    table: Any, where: tuple[str, ...], defaults: SourceConfig, motion: Motion, problems: Problems
 ) -> dict[str, SourceConfig]:
     if not isinstance(table, Mapping):
         problems.append((where, f"is {table!r}, must be a table of tables"))
@@ -117,11 +121,12 @@ def _read_sources(
     for name, value in table.items():
         key = (*where, str(name))
         try:
-            check_name(str(name))
+            check_source(str(name))
         except ValueError as error:
             problems.append((key, str(error)))
+        base = dataclasses.replace(defaults, motion=motion) if str(name).startswith(centre_source("")) else defaults
         sources[str(name)] = (
-            value if isinstance(value, SourceConfig) else _read(SourceConfig, value, key, problems, defaults)
+            value if isinstance(value, SourceConfig) else _read(SourceConfig, value, key, problems, base)
         )
     return sources
 

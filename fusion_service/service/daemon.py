@@ -14,7 +14,18 @@ from collections import Counter
 from typing import NamedTuple
 
 from fusion_service.bus import Bus, Inbox, open_bus
-from fusion_service.centre import ClockSet, MessageClock, Order, Refused, SourceFound, SourceLost, StepResult, WallClock
+from fusion_service.centre import (
+    ClockSet,
+    MessageClock,
+    Order,
+    Refused,
+    SourceFound,
+    SourceLost,
+    StepResult,
+    WallClock,
+    is_picture_of,
+    source_of,
+)
 from fusion_service.config import ServiceConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.notify import notify
@@ -23,7 +34,18 @@ from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker
 from fusion_service.service.stepping import LastingCentre
 from fusion_service.service.tokens import Tokens
-from schemas import LocalIntensity, LocalTracks, MessageError, decode, encode, global_key, local_key, parse_key
+from schemas import (
+    GlobalTracks,
+    LocalIntensity,
+    LocalTracks,
+    MessageError,
+    centre_source,
+    decode,
+    encode,
+    global_key,
+    local_key,
+    parse_key,
+)
 
 __all__ = ["Service", "run_service"]
 
@@ -100,6 +122,9 @@ class Service:
         bus.watch(local_key("*", "alive", realm), self._tokens.note)
         for what in ("info", "tracks", "intensity"):
             bus.subscribe(local_key("*", what, realm), self._on_sample, on_miss=self._on_miss)
+        for centre in filter(None, map(is_picture_of, self._config.centre.sources)):
+            bus.watch(global_key(centre, "alive", realm), self._tokens.note)
+            bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
         bus.answer(global_key(name, "orders", realm), self._desk.answer)
         bus.announce(global_key(name, "alive", realm))
@@ -111,8 +136,10 @@ class Service:
     # Called on threads of the bus: must return at once
 
     def _on_sample(self, key: str, data: bytes) -> None:
-        name = key.rsplit("/", 2)[-2]
-        self._inbox.put(name, Arrival(key, data, time.time_ns()), len(data))
+        scope, name, _ = key.rsplit("/", 3)[-3:]
+        self._inbox.put(
+            centre_source(name) if scope == "global" else name, Arrival(key, data, time.time_ns()), len(data)
+        )
 
     def _on_miss(self, key: str, count: int) -> None:
         self._counts["missed"] += count
@@ -134,17 +161,17 @@ class Service:
         self._counts["bytes"] += len(item.data)
         name = item.key.rsplit("/", 2)[-2]
         try:
-            name = parse_key(item.key).name
+            name = parse_key(item.key).source
             message = decode(item.data)
         except ValueError as error:
             reason = error.reason if isinstance(error, MessageError) else "key"
             self._lasting.handle(Refused(name[:64], reason), item.received)
             return
-        if message.source != name:
+        if source_of(message) != name:
             self._lasting.handle(Refused(name, "source"), item.received)
             return
         fault = ""
-        if self._message_clock is not None and isinstance(message, (LocalTracks, LocalIntensity)):
+        if self._message_clock is not None and isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)):
             fault = self._message_clock.fault(message, item.received)
         self._lasting.handle(Refused(name, fault) if fault else message, item.received)
 

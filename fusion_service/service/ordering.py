@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.centre import NEEDED, WHAT, Centre, Order, View, judge, read_order
-from schemas import check_name
+from schemas import check_source
 
 __all__ = ["OrderDesk"]
 
@@ -99,7 +99,7 @@ class OrderDesk:
             if raw.get(name) is None:
                 raise ValueError(f"the order {raw['what']} needs: {', '.join(NEEDED[raw['what']])}")
         if "source" in NEEDED.get(raw["what"], ()):
-            check_name(raw["source"] if isinstance(raw["source"], str) else str([raw["source"]]))
+            check_source(raw["source"] if isinstance(raw["source"], str) else str([raw["source"]]))
         refused = ""
         for name in ("track", "other"):
             if raw.get(name) is not None:

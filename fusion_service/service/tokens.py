@@ -26,7 +26,7 @@ class Tokens:
     def note(self, key: str, alive: bool) -> None:
         """A token has come or gone. Returns at once."""
         try:
-            name = parse_key(key).name
+            name = parse_key(key).source
         except ValueError:
             return
         with self._lock:

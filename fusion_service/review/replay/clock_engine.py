@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections import Counter
 
-from fusion_service.centre import MessageClock, Refused
+from fusion_service.centre import MessageClock, Refused, source_of
 from fusion_service.config import CentreConfig
 from fusion_service.recording.steps import Step
 from fusion_service.review.replay.engine import OnStep
 from fusion_service.review.replay.inputs import LocalMessage
 from fusion_service.review.replay.player import Player
-from schemas import GlobalTracks, LocalIntensity, LocalTracks, StepLog
+from schemas import GlobalTracks, SensorInfo, StepLog
 
 __all__ = ["ClockEngine"]
 
@@ -36,13 +36,13 @@ class ClockEngine:
         for player, config, clock in zip(self._players, self._configs, self._clocks, strict=True):
             if player.centre is None:
                 player.begin(config, None, 1, received)
-            fault = clock.fault(message, received) if isinstance(message, LocalTracks | LocalIntensity) else ""
+            fault = "" if isinstance(message, SensorInfo) else clock.fault(message, received)
             if fault:
-                player.handle(Refused(message.source, fault), received)
+                player.handle(Refused(source_of(message), fault), received)
             else:
                 player.handle(message, received)
             self._step_all(player, clock, received)
-        self._names.add(message.source)
+        self._names.add(source_of(message))
 
     def output(self, message: StepLog | GlobalTracks, received: int) -> None:
         """What a recorded centre made is not looked at."""

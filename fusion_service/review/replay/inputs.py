@@ -11,7 +11,8 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from schemas import LocalIntensity, LocalTracks, SensorInfo, StepLog
+from fusion_service.centre import source_of
+from schemas import GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, StepLog
 
 __all__ = ["Input", "InputBuffer", "LocalMessage"]
 
@@ -24,8 +25,8 @@ SWEEP = 64
 MARGIN = 60.0
 """Seconds beyond `lateness` after which a message is too old."""
 
-LocalMessage = LocalTracks | LocalIntensity | SensorInfo
-"""What a source sends."""
+LocalMessage = LocalTracks | LocalIntensity | SensorInfo | GlobalTracks
+"""What a source sends; the picture of another centre is what that one sends."""
 
 
 @dataclass(slots=True)
@@ -57,7 +58,7 @@ class InputBuffer:
             return
         self._inputs[code] = one
         self._bytes += one.size
-        recent = self._recent.setdefault((one.message.source, one.message.type), deque())
+        recent = self._recent.setdefault((source_of(one.message), one.message.type), deque())
         recent.append(code)
         if len(recent) > SENT_AGAIN:
             old = recent.popleft()
@@ -103,12 +104,12 @@ class InputBuffer:
         return [
             code
             for code, one in self._inputs.items()
-            if not one.named and (one.message.source, one.message.epoch, one.message.seq) == (source, epoch, seq)
+            if not one.named and (source_of(one.message), one.message.epoch, one.message.seq) == (source, epoch, seq)
         ]
 
     def _name(self, code: int, one: Input) -> None:
         one.named = True
-        if code not in self._recent[one.message.source, one.message.type]:
+        if code not in self._recent[source_of(one.message), one.message.type]:
             self._drop(code)
 
     def _drop(self, code: int) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from fusion_service import __version__
+from fusion_service.centre import is_picture_of
 from fusion_service.config import CentreConfig, ConfigError, centre_config, config_hash
 from fusion_service.config.settings import nested, plain_settings
 from fusion_service.errors import ReviewError
@@ -59,6 +60,12 @@ class MissionSettings:
         others = [version for version in followed.versions if version != __version__]
         if others:
             self.remarks.append(f"recorded by version {', '.join(others)}, this is {__version__}: they may differ")
+
+    @property
+    def centres(self) -> set[str]:
+        """The sources, of all runs, that are other centres."""
+        runs = [self.first, *self._recorded.values()]
+        return {name for tables in runs for name in tables.get("sources", {}) if is_picture_of(name)}
 
     def _look(self, found: Survey, followed: RecordedCentre) -> None:
         """Check the recorded settings: they must be usable, and those of their hash."""

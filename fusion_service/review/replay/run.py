@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -32,7 +32,7 @@ from fusion_service.review.replay.player import Player
 from fusion_service.review.replay.variants import variants_of
 from fusion_service.review.replay.verifying import Difference, Verdict
 from fusion_service.review.replay.writer import ReplayWriter
-from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, decode
+from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, centre_source, decode
 
 __all__ = ["Replay", "run_replay"]
 
@@ -111,10 +111,10 @@ def run_replay(
     followed = found.chosen(centre)
     if verify and followed is None:
         raise ReviewError(f"{path} has no step logs of a centre: there is nothing to verify")
-    if not found.inputs:
-        raise ReviewError(f"{path} holds no messages of sources: there is nothing to fuse")
     players = [Player(one) for one in variants_of(rules, settings, found.sources | set(found.centres))]
     own = MissionSettings(found, followed, given, by_clock=clock)
+    if not found.inputs and not own.centres & {centre_source(name) for name in found.centres}:
+        raise ReviewError(f"{path} holds no messages of sources: there is nothing to fuse")
     own.check([player.variant for player in players])
     if verify and own.foreign:
         raise ReviewError(f"{config} does not hold the settings of the mission (hash {own.foreign}): leave it out")
@@ -156,7 +156,7 @@ def _play(
     else:
         configs = [player.variant.config(settings.first) for player in replay.players]
         engine = ClockEngine(replay.players, configs, on_step)
-    now, unread = 0, 0
+    now, unread, centres = 0, 0, settings.centres
     with Progress("Fusing") as bar:
         for number, raw in enumerate(read(found.path)):
             if stop.is_set():
@@ -166,7 +166,7 @@ def _play(
             if writer is not None:
                 writer.copy(raw)
             try:
-                _feed(engine, raw, found.realm, followed)
+                _feed(engine, raw, found.realm, followed, centres)
             except MessageError:
                 unread += 1
             replay.most_buffered = max(replay.most_buffered, engine.buffered)
@@ -183,18 +183,22 @@ def _play(
     replay.remarks += engine.remarks()
 
 
-def _feed(engine: Engine, raw: RawMessage, realm: str, followed: RecordedCentre | None) -> None:
-    """Give `engine` a message of a source, or of the centre that is followed; `MessageError` if it does not decode."""
+def _feed(
+    engine: Engine, raw: RawMessage, realm: str, followed: RecordedCentre | None, centres: Collection[str]
+) -> None:
+    """Give `engine` a message of a source, those of `centres` included, or of the centre that is followed;
+    `MessageError` if it does not decode."""
     key = key_of(raw.key)
     if key is None or key.realm != realm:
         return
     ours = followed is not None and key.scope == "global" and key.name == followed.name
-    if not (ours and key.what in ("tracks", "log")) and key.scope != "local":
+    told = key.scope == "local" or (key.source in centres and key.what == "tracks")
+    if not (ours and key.what in ("tracks", "log")) and not told:
         return
     message = decode(raw.data)
     if message.source != key.name:
         return
-    if isinstance(message, LocalTracks | LocalIntensity | SensorInfo):
+    if not ours and isinstance(message, LocalTracks | LocalIntensity | SensorInfo | GlobalTracks):
         engine.input(message, raw.received, len(raw.data))
     elif isinstance(message, StepLog | GlobalTracks):
         engine.output(message, raw.received)

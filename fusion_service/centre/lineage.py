@@ -1,0 +1,191 @@
+"""`Lineages`: which sources' data a track contains, as small codes so that columns can hold them.
+
+A lineage is a set of names. Names and sets get their numbers at first sight, and messages are seen in canonical order,
+so that numbers do not depend on arrival; what nobody uses any more is forgotten when the table has grown, which changes
+the codes: the columns go with it. Where the table is full of what is in use, a new set is `ANYONE`, which overlaps all:
+a lineage is never told smaller than it is.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.arrays import Bools, Ints
+from schemas import GlobalTracks, LocalTracks
+
+__all__ = ["ALONE", "ANYONE", "NOBODY", "Codes", "Kin", "Lineages", "Masks", "overlapping"]
+
+Codes = NDArray[np.int32]
+Masks = NDArray[np.uint64]
+"""Sets as bits, (W, M): name k is bit k % 64 of word k // 64."""
+
+ALONE = -1
+"""Of a local track: its source alone. Of a global track: not known, as `ANYONE`."""
+NOBODY, ANYONE = 0, 1
+MOST_NAMES = 4096
+MOST_SETS = 16_384
+ROOM = 1000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Kin:
+    """Of M rows: code (M,) of the lineage of each in the table, and whether it contains data of this centre, (M,)."""
+
+    table: Lineages
+    code: Codes
+    echo: Bools
+
+
+class Lineages:
+    """A table of names and of sets of them. names[0] stands for anyone at all."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = [""]
+        self._bits: dict[str, int] = {"": 0}
+        self._sets: list[int] = [0, 1]
+        self._codes: dict[int, int] = {0: NOBODY, 1: ANYONE}
+        self._table: Masks = np.array([[0, 1]], dtype=np.uint64)
+
+    def __len__(self) -> int:
+        return len(self._sets)
+
+    def of(self, names: Iterable[str]) -> int:
+        """The code of a set of names."""
+        whole = 0
+        for name in names:
+            whole |= 1 << self._bit(name)
+        return self._code(whole)
+
+    def of_message(self, message: LocalTracks | GlobalTracks) -> Codes:
+        """The codes (T,) of the tracks of a message, `ALONE` where nothing is said; a track of which no name is said
+        contains all that the message does."""
+        count, lineage = len(message.ids), message.lineage
+        if not lineage:
+            return np.full(count, ALONE, dtype=np.int32)
+        if message.track_lineage is None or not count:
+            return np.full(count, self.of(lineage), dtype=np.int32)
+        said = np.unpackbits(message.track_lineage, axis=1, count=len(lineage), bitorder="little").astype(np.bool_)
+        said[~said.any(axis=1)] = True
+        sets, which = np.unique(np.packbits(said, axis=1), axis=0, return_inverse=True)
+        rows = np.unpackbits(sets, axis=1, count=len(lineage))
+        codes = [self.of(lineage[k] for k in np.flatnonzero(row).tolist()) for row in rows]
+        return np.array(codes, dtype=np.int32)[which.reshape(-1)]
+
+    def masks(self, codes: Codes) -> Masks:
+        """The sets (W, M) of codes (M,)."""
+        if self._table.shape[1] != len(self._sets) or len(self._table) != self._words:
+            self._table = np.zeros((self._words, len(self._sets)), dtype=np.uint64)
+            for number, whole in enumerate(self._sets):
+                for word in range(-(-whole.bit_length() // 64)):
+                    self._table[word, number] = whole >> (64 * word) & (2**64 - 1)
+        return np.ascontiguousarray(self._table[:, np.where(codes < 0, ANYONE, codes)])
+
+    def codes(self, masks: Masks) -> Codes:
+        """The codes (M,) of sets (W, M)."""
+        if not masks.shape[1]:
+            return np.zeros(0, dtype=np.int32)
+        if len(masks) == 1:
+            flat, which = np.unique(masks[0], return_inverse=True)
+            sets = flat[None]
+        else:
+            sets, which = np.unique(masks, axis=1, return_inverse=True)
+        wholes = [sum(int(part) << (64 * word) for word, part in enumerate(row)) for row in sets.T.tolist()]
+        found = np.array([self._code(whole) for whole in wholes], dtype=np.int32)
+        return found[which.reshape(-1)]
+
+    def union(self, codes: Codes) -> Masks:
+        """The union (W, B) of the sets of each column of codes (k, B)."""
+        return np.asarray(np.bitwise_or.reduce(self.masks(codes.reshape(-1)).reshape(-1, *codes.shape), axis=1))
+
+    def contain(self, codes: Codes, name: str) -> Bools:
+        """Which of the sets (M,) hold `name`, or anyone."""
+        bits = [0, self._bits[name]] if name in self._bits else [0]
+        found = np.zeros(len(codes), dtype=np.bool_)
+        masks = self.masks(codes)
+        for bit in bits:
+            found |= masks[bit // 64] >> np.uint64(bit % 64) & np.uint64(1) == 1
+        return found
+
+    def told(self, codes: Codes, known: Iterable[str], own: str) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
+        """What a picture says: the names that are in it, `own` the last, and the bits (T, ceil(L/8)) of its tracks.
+        known: names that it tells in any case."""
+        masks = self.masks(codes)
+        words = np.bitwise_or.reduce(masks, axis=1).tolist()
+        used = [k for k in range(1, len(self.names)) if words[k // 64] >> (k % 64) & 1]
+        names = (*sorted(({*known} | {self.names[k] for k in used}) - {own}), own)
+        anyone = masks[0] & np.uint64(1) == 1
+        bits = np.zeros((len(codes), len(names)), dtype=np.bool_)
+        place = {name: at for at, name in enumerate(names)}
+        for k in used:
+            bits[:, place[self.names[k]]] = masks[k // 64] >> np.uint64(k % 64) & np.uint64(1) == 1
+        bits[anyone] = True
+        bits[:, -1] = True
+        return names, np.packbits(bits, axis=1, bitorder="little")
+
+    def compacted(self, used: Sequence[Codes]) -> Codes | None:
+        """Forget the sets, and names, that no column uses, where they are many: the new code of each old one, to index
+        with a column (-1, the last, stays -1); None where the table stays."""
+        if len(self._sets) < ROOM and len(self.names) < MOST_NAMES // 2:
+            return None
+        mark = np.zeros(len(self._sets) + 1, dtype=np.bool_)
+        mark[:2] = True
+        for codes in used:
+            mark[codes] = True
+        mark[-1] = False
+        if 2 * int(mark.sum()) > len(self._sets) and len(self.names) < MOST_NAMES:
+            return None
+        kept = [(self._named(self._sets[code]), code) for code in np.flatnonzero(mark).tolist()]
+        new = np.full(len(mark), ALONE, dtype=np.int32)
+        self.restore({"names": [], "sets": []})
+        for names, code in kept:
+            new[code] = self.of(names)
+        return new
+
+    def kept(self) -> dict[str, Any]:
+        """What a checkpoint holds of it, as plain values."""
+        packed = [one.to_bytes(-(-one.bit_length() // 8), "little") for one in self._sets[2:]]
+        return {"names": self.names[1:], "sets": packed}
+
+    def restore(self, kept: Mapping[str, Any]) -> None:
+        """Go on with what `kept` gave."""
+        Lineages.__init__(self)
+        for name in kept["names"]:
+            self._bit(str(name))
+        for packed in kept["sets"]:
+            self._code(int.from_bytes(packed, "little"))
+
+    @property
+    def _words(self) -> int:
+        return -(-len(self.names) // 64)
+
+    def _bit(self, name: str) -> int:
+        if name not in self._bits:
+            if len(self.names) >= MOST_NAMES:
+                return 0
+            self._bits[name] = len(self.names)
+            self.names.append(name)
+        return self._bits[name]
+
+    def _code(self, whole: int) -> int:
+        if whole not in self._codes:
+            if len(self._sets) >= MOST_SETS:
+                return ANYONE
+            self._codes[whole] = len(self._sets)
+            self._sets.append(whole)
+        return self._codes[whole]
+
+    def _named(self, whole: int) -> list[str]:
+        return [name for k, name in enumerate(self.names) if whole >> k & 1]
+
+
+def overlapping(masks: Masks, members: Ints) -> Bools:
+    """Which rows of each of B groups have data in common (B, k, k). members (B, k): columns of masks (W, M)."""
+    sets = masks[:, members]
+    meet = (sets[:, :, :, None] & sets[:, :, None, :]).any(axis=0)
+    anyone = sets[0] & np.uint64(1) == 1
+    return np.asarray(meet | anyone[:, :, None] | anyone[:, None, :])
