@@ -31,9 +31,9 @@ from sensor_clients.events import Event, Parameter, Scenario
 from sensor_clients.filters.measurement import STATE, Floats
 from sensor_clients.playback.own_place import OwnPlace, Pose
 from sensor_clients.playback.robot import MRCLAM
-from sensor_clients.playback.sighted import Others
+from sensor_clients.playback.sighted import Others, Seen
 
-__all__ = ["FRAME", "PARAMETERS", "SENSORS", "SETS", "SUMMARY", "Recorded", "load", "read"]
+__all__ = ["FRAME", "PARAMETERS", "ROBOTS", "SENSORS", "SETS", "SUMMARY", "Recorded", "load", "read"]
 
 SETS = (6,)
 ROBOTS = range(1, 6)
@@ -157,19 +157,7 @@ def seen_events(recorded: Recorded, start: int, end: int, seed: int = 0) -> Iter
             told = pose.mean, common
             yield Event(time, "info", _info(recorded.number, pose.mean, common))
         seen = robot.others.report(time, told[1])
-        yield Event(
-            time,
-            "tracks",
-            {
-                "space": STATE,
-                "frame": FRAME,
-                "ids": seen.ids,
-                "means": seen.means,
-                "covariances": seen.covariances,
-                "updated": seen.updated,
-                "identity": tuple(f"robot:{subject}" for subject in seen.subjects),
-            },
-        )
+        yield Event(time, "tracks", _tracks(seen))
 
 
 def self_events(recorded: Recorded, start: int, end: int, seed: int = 0) -> Iterator[Event]:
@@ -186,8 +174,22 @@ def self_events(recorded: Recorded, start: int, end: int, seed: int = 0) -> Iter
         if not np.hypot(*(pose.mean - told)[:2]) <= MOVED:
             told = pose.mean
             yield Event(time, "info", _info(recorded.number, pose.mean, None))
-        fields = {"space": STATE, "frame": FRAME, "ids": [epoch], "means": state[0][None], "covariances": state[1][None]}
-        yield Event(time, "tracks", fields | {"updated": [time], "identity": (f"robot:{recorded.number}",)})
+        now, mean, covariance = np.array([time]), state[0][None], state[1][None]
+        own = Seen(np.array([epoch], dtype=np.uint64), [recorded.number], mean, covariance, now)
+        yield Event(time, "tracks", _tracks(own))
+
+
+def _tracks(seen: Seen) -> dict[str, Any]:
+    return {
+        "complete": True,
+        "space": STATE,
+        "frame": FRAME,
+        "ids": seen.ids,
+        "means": seen.means,
+        "covariances": seen.covariances,
+        "updated": seen.updated,
+        "identity": tuple(f"robot:{subject}" for subject in seen.subjects),
+    }
 
 
 def _changed(told: tuple[Floats, Floats], now: tuple[Floats, Floats]) -> bool:
