@@ -5,16 +5,16 @@ from __future__ import annotations
 import argparse
 import itertools
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from fusion_service.bus import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.errors import UsageError
 from fusion_service.process import argument, data_folder, exit_code, positive, stop_on_signals, whole
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
-from sensor_clients.playback import autoferry, radar_v2x, table
+from sensor_clients.playback import autoferry, mrclam, radar_v2x, table
 from sensor_clients.publisher import TrackPublisher, TruthPublisher
 from sensor_clients.runner import pace
 from sensor_clients.scenarios.three_radars import TRACKERS, three_radars
@@ -29,8 +29,23 @@ EXAMPLES = """examples:
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
   sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
   sensor-client playback radar-v2x --sensor radar --data /data
+  sensor-client playback mrclam:6 --sensor robot1 --data /data
   sensor-client playback tracks.csv --sensor radar1        what `fusion-service export` has written
 """
+
+
+class _Recorded(NamedTuple):
+    """Recordings with a number: which there are, how one is read, and what its files are called."""
+
+    numbers: tuple[int, ...]
+    load: Callable[[Path, int], Scenario]
+    files: str
+
+
+RECORDED = {
+    "autoferry": _Recorded(autoferry.SCENARIOS, autoferry.load, "the Autoferry JSON files"),
+    "mrclam": _Recorded(mrclam.SETS, mrclam.load, "the MR.CLAM sets, or one above it"),
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -55,7 +70,7 @@ def _parser() -> argparse.ArgumentParser:
     playback = _command(commands, "playback", "play recorded returns through a local tracker, or tracks", EXAMPLES)
     numbers = ", ".join(map(str, autoferry.SCENARIOS))
     playback.add_argument(
-        "scenario", help=f"autoferry:N, N one of {numbers}; radar-v2x; or a .csv or .parquet file of tracks"
+        "scenario", help=f"autoferry:N, N one of {numbers}; mrclam:6; radar-v2x; or a .csv or .parquet file of tracks"
     )
     playback.add_argument(
         "--data", type=Path, help="directory of the recording, or that holds it by its name (default: $FUSION_DATA)"
@@ -102,6 +117,10 @@ def _list(_: argparse.Namespace) -> None:
     print(f"playback radar-v2x  {radar_v2x.SUMMARY}")
     print(f"  sensors: {', '.join(radar_v2x.SENSORS)}; needs --data or FUSION_DATA")
     print(_table(radar_v2x.PARAMETERS))
+    print()
+    print(f"playback mrclam:N  N in {', '.join(map(str, mrclam.SETS))}: {mrclam.SUMMARY}")
+    print(f"  sensors: {', '.join(mrclam.SENSORS)}, truth; needs --data or FUSION_DATA")
+    print(_table(mrclam.PARAMETERS))
 
 
 def _describe(scenario: Scenario, command: str) -> str:
@@ -134,15 +153,16 @@ def _playback(arguments: argparse.Namespace) -> None:
         _publish(radar_v2x.load(radar_v2x.find(folder)), arguments, 0)
         return
     name, _, number = arguments.scenario.partition(":")
-    if name != "autoferry" or number not in map(str, autoferry.SCENARIOS):
-        known = ", ".join(f"autoferry:{n}" for n in autoferry.SCENARIOS)
+    kind = RECORDED.get(name)
+    if kind is None or number not in map(str, kind.numbers):
+        known = ", ".join(f"{name}:{n}" for name, kind in RECORDED.items() for n in kind.numbers)
         raise UsageError(
             f"no recorded scenario {arguments.scenario!r}; known: {known}, radar-v2x, or a .csv or .parquet file"
         )
-    data = data_folder("autoferry", arguments.data)
+    data = data_folder(name, arguments.data)
     if data is None:
-        raise UsageError("no data: say --data DIR or set FUSION_DATA to the directory of the Autoferry JSON files")
-    _publish(autoferry.load(data, int(number)), arguments, 0)
+        raise UsageError(f"no data: say --data DIR or set FUSION_DATA to the directory of {kind.files}")
+    _publish(kind.load(data, int(number)), arguments, 0)
 
 
 def _publish(

@@ -14,14 +14,15 @@ HELP = "A whole mission: hub, service, clients and recorder as processes, then a
 EXAMPLE = """fusion-service demo
   fusion-service demo --rule hmd-ga --json result.json
   fusion-service demo --scenario autoferry:2 --data DIR --speed 10
+  fusion-service demo --scenario mrclam:6 --data DIR --speed 30
   fusion-service demo --rule bci --set rule_options.max_correlation=0.5 --set gate=0.99"""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
-    parser.add_argument("--scenario", default="three-radars", help="three-radars (default), or autoferry:N")
+    parser.add_argument("--scenario", default="three-radars", help="three-radars (default), autoferry:N, or mrclam:6")
     parser.add_argument(
-        "--data", metavar="DIR", help="folder of the Autoferry files, or that holds autoferry/ (default: $FUSION_DATA)"
+        "--data", metavar="DIR", help="folder of the recordings, or that holds autoferry/, mrclam/ (default: $FUSION_DATA)"
     )
     parser.add_argument("--rule", default="ci", help="fusion rule (default ci; `fusion-service rules` lists them)")
     parser.add_argument("--criterion", help="of the rule's weights: det or trace")

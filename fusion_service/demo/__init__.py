@@ -5,11 +5,12 @@ scores are computed from the recording.
 """
 
 from fusion_service.demo.crew import Crew, DemoError, client_arguments, free_endpoint, record_arguments
-from fusion_service.demo.missions import AUTOFERRY, THREE_RADARS, MissionPlan, plan_mission
+from fusion_service.demo.missions import AUTOFERRY, MRCLAM, THREE_RADARS, MissionPlan, plan_mission
 from fusion_service.demo.run import START, run_demo, write_config
 
 __all__ = [
     "AUTOFERRY",
+    "MRCLAM",
     "START",
     "THREE_RADARS",
     "Crew",

@@ -9,7 +9,7 @@ from typing import Any
 from fusion_service.errors import DataError, UsageError
 from fusion_service.process import data_folder
 
-__all__ = ["AUTOFERRY", "THREE_RADARS", "MissionPlan", "plan_mission"]
+__all__ = ["AUTOFERRY", "MRCLAM", "THREE_RADARS", "MissionPlan", "plan_mission"]
 
 JITTER = 1.5
 """Seconds that the machine may hold a client up, and it is still waited for."""
@@ -29,6 +29,15 @@ motion = {kind = "cv", q = 0.1}
 coast = 3.0
 """
 """Settings of the centre for the recorded lidar and radar, as TOML."""
+
+MRCLAM = """\
+period = 1.0
+frame = {kind = "local", name = "mrclam"}
+motion = {kind = "cv", q = 1.2e-4}   # 0.06 m/s, another way every 30 s, as the robots declare
+manoeuvre = 0.1                      # m/s2: they stop, and go, within a second
+coast = 3.0
+"""
+"""Settings of the centre for the recorded robots, as TOML."""
 
 
 @dataclass(frozen=True)
@@ -53,14 +62,16 @@ class MissionPlan:
 def plan_mission(
     scenario: str, *, data: str | None = None, seed: int = 1, tracker: str = "ckf", cameras: bool = False
 ) -> MissionPlan:
-    """The plan of `three-radars` (with `seed` and `tracker`) or of `autoferry:N` (from `data`, or $FUSION_DATA).
+    """The plan of `three-radars` (with `seed` and `tracker`), of `autoferry:N` or `mrclam:6` (from `data`, or
+    $FUSION_DATA).
 
     Raises `UsageError` for any other, for options that do not go with it and where no data are named; `DataError` where
     they are not there.
     """
+    kind, _, number = scenario.partition(":")
+    if cameras and kind != "autoferry":
+        raise UsageError("--cameras goes with --scenario autoferry:N")
     if scenario == "three-radars":
-        if cameras:
-            raise UsageError("--cameras goes with --scenario autoferry:N")
         command = ["simulate", "three-radars", "--tracker", tracker, "--seed", str(seed), "--sensor"]
         sensors = ("radar1", "radar2", "radar3", "truth")
         return MissionPlan(
@@ -68,14 +79,22 @@ def plan_mission(
         )
     if tracker != "ckf":
         raise UsageError("--tracker goes with --scenario three-radars")
-    kind, _, number = scenario.partition(":")
-    if kind != "autoferry" or not number.isdigit():
-        raise UsageError(f"unknown scenario {scenario!r}: use three-radars, or autoferry:N with N one of 2 3 5 13 16")
-    folder = data_folder("autoferry", data)
+    if kind not in ("autoferry", "mrclam") or not number.isdigit():
+        raise UsageError(
+            f"unknown scenario {scenario!r}: use three-radars, autoferry:N with N one of 2 3 5 13 16, or mrclam:6"
+        )
+    folder = data_folder(kind, data)
     if folder is None:
-        raise UsageError("autoferry needs its recordings: give their folder with --data or in FUSION_DATA")
-    if not (folder / f"scenario{number}_detections.json").is_file():
-        raise DataError(f"no scenario{number}_detections.json in {folder}: --data names the Autoferry folder")
+        raise UsageError(f"{kind} needs its recordings: give their folder with --data or in FUSION_DATA")
+    first = f"scenario{number}_detections.json" if kind == "autoferry" else f"{number}/landmarks.csv"
+    if not (folder / first).is_file():
+        name = {"autoferry": "Autoferry", "mrclam": "MR.CLAM"}[kind]
+        raise DataError(f"no {first} in {folder}: --data names the {name} folder")
     command = ["playback", scenario, "--data", str(folder), "--sensor"]
+    if kind == "mrclam":
+        robots = (f"robot{n}{suffix}" for suffix in ("", "-self") for n in range(1, 6))
+        return MissionPlan(
+            scenario, {name: [*command, name] for name in (*robots, "truth")}, MRCLAM, 756.0, 10.0, 1.0, 1.0, 3.0
+        )
     clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
     return MissionPlan(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)
