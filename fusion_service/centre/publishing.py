@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.labels import Labels
-from fusion_service.centre.lifecycle import Picture, Support, advance
+from fusion_service.centre.lifecycle import WAYS, Picture, Support, advance
 from fusion_service.centre.pictures import is_picture_of
 from fusion_service.config import CentreConfig
 from fusion_service.coverage import region_holds
@@ -93,6 +93,7 @@ def picture_message(
         contributor_influence=contributions.influence,
         ended=journal.ended(),
         split_from=journal.splits(),
+        **_ways(picture, rule),
         **labels.columns(picture.id, origin),
     )
 
@@ -124,6 +125,14 @@ def _lineage(picture: Picture, intake: Intake) -> dict[str, Any]:
         return {"lineage": (*(name for name in names if name != own), own)}
     lineage, bits = intake.lineages.told(picture.lineage, names, own)
     return {"lineage": lineage, "track_lineage": bits if bits.size <= MOST_BITS else None}
+
+
+def _ways(picture: Picture, rule: str) -> dict[str, Any]:
+    """What each track was fused by, where that is not the rule for all."""
+    if not picture.way.any():
+        return {}
+    used, which = np.unique(picture.way, return_inverse=True)
+    return {"rules": tuple(WAYS[way] or rule for way in used.tolist()), "track_rule": which.astype(np.uint8)}
 
 
 def _densities(picture: Picture, publish: str) -> dict[str, Any]:
