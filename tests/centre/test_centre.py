@@ -39,7 +39,7 @@ def bytes_of(results: list[StepResult]) -> list[bytes]:
     return [schemas.encode(part) for result in results for part in (result.tracks, result.log)]
 
 
-@pytest.mark.parametrize("memory", ["restart", "recursive"])
+@pytest.mark.parametrize("memory", ["restart", "recursive", "tracklet"])
 @pytest.mark.parametrize("rule", ["naive", "ci", "hmd-ga"])
 def test_same_events_same_bytes_in_any_order(rule: str, memory: str) -> None:
     first = bytes_of(mission(lambda batch: batch, rule=rule, memory=memory))
@@ -357,7 +357,7 @@ def test_orders() -> None:
 # Checkpoint and ids
 
 
-@pytest.mark.parametrize("memory", ["restart", "recursive"])
+@pytest.mark.parametrize("memory", ["restart", "recursive", "tracklet"])
 @pytest.mark.parametrize("cut", [1, 3, 5])
 def test_a_centre_from_a_checkpoint_goes_on_bit_for_bit(memory: str, cut: int) -> None:
     rng = np.random.default_rng(3)

@@ -14,7 +14,7 @@ from tests.centre.worlds import SECOND, START, info, moved, seen, tracks, truth
 from tests.helpers import fuse_again
 
 
-@pytest.mark.parametrize("memory", ["restart", "recursive"])
+@pytest.mark.parametrize("memory", ["restart", "recursive", "tracklet"])
 @pytest.mark.parametrize("rule", ["naive", "ci", "hmd-ga"])
 def test_a_messy_mission_is_made_again(rule: str, memory: str) -> None:
     """Late, lost, repeated and bad messages, restarts of sources and of the centre, orders."""

@@ -61,7 +61,7 @@ def settings(rng: np.random.Generator) -> CentreConfig:
         "lateness": one(0.0, 2.0, 5.0),
         "coast": one(0.0, 2.0, 5.0),
         "period": one(0.5, 1.0),
-        "memory": one("restart", "recursive"),
+        "memory": one("restart", "recursive", "tracklet", "tracklet"),
         "memory_correlation": one(1.0, 0.5),
         "rule": one("ci", "naive", "aa", "ici", "ei", "cu", "hmd-ga", "fast-ci"),
         "mixture_rule": one("moments", "gm-ga", "aa", "cu-modes"),
