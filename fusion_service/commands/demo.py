@@ -22,7 +22,9 @@ def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
     parser.add_argument("--scenario", default="three-radars", help="three-radars (default), autoferry:N, or mrclam:6")
     parser.add_argument(
-        "--data", metavar="DIR", help="folder of the recordings, or that holds autoferry/, mrclam/ (default: $FUSION_DATA)"
+        "--data",
+        metavar="DIR",
+        help="folder of the recordings, or that holds autoferry/, mrclam/ (default: $FUSION_DATA)",
     )
     parser.add_argument("--rule", default="ci", help="fusion rule (default ci; `fusion-service rules` lists them)")
     parser.add_argument("--criterion", help="of the rule's weights: det or trace")

@@ -24,6 +24,8 @@ from sensor_clients.playback.robot import Robot, wrapped
 __all__ = ["OwnPlace", "Pose"]
 
 SECOND = 1e-9
+DEGENERATE = 1e12
+"""Condition from which the sightings do not determine a pose."""
 
 
 class Pose(NamedTuple):
@@ -162,7 +164,7 @@ class OwnPlace:
     def _begin(self, time: int) -> None:
         """Lay what was seen lately on the map, if that is enough and agrees."""
         robot = self.robot
-        newest = {self._object[one.landmark]: one for one in self._pending if (time - one.time) * SECOND <= robot.reach}
+        newest = {one.landmark: one for one in self._pending if (time - one.time) * SECOND <= robot.reach}
         self._pending = list(newest.values())
         places = np.array([self.landmarks[one.landmark] for one in self._pending])
         if len(places) < robot.landmarks or np.ptp(places, axis=0).max() < robot.baseline:
@@ -183,17 +185,19 @@ class OwnPlace:
         seen = [self._relative(one) for one in self._pending]
         found = np.array([[r * math.cos(b), r * math.sin(b)] for r, b in seen])
         away, there = found - found.mean(axis=0), places - places.mean(axis=0)
-        h = math.atan2(
-            float((away[:, 0] * there[:, 1] - away[:, 1] * there[:, 0]).sum()), float((away * there).sum())
-        )
+        h = math.atan2(float((away[:, 0] * there[:, 1] - away[:, 1] * there[:, 0]).sum()), float((away * there).sum()))
         turned = np.array([[math.cos(h), -math.sin(h)], [math.sin(h), math.cos(h)]]) @ found.mean(axis=0)
         pose = np.array([*(places.mean(axis=0) - turned), h])
+        objects = [self._object[one.landmark] for one in self._pending]
+        shared = np.array([[float(objects.count(one))] for one in objects])
         ages = np.array([(time - one.time) * SECOND for one in self._pending])
         for _ in range(10):
             rows = [self._compare(pose, one.landmark, r, b) for one, (r, b) in zip(self._pending, seen, strict=True)]
             nu, H, R = (np.array(column) for column in zip(*rows, strict=True))
-            R = R + np.outer(ages, [self.robot.walk**2, self.robot.turn_walk**2])
+            R = R * shared + np.outer(ages, [self.robot.walk**2, self.robot.turn_walk**2])
             normal = np.einsum("kai,ka,kaj->ij", H, 1 / R, H)
+            if not np.isfinite(normal).all() or np.linalg.cond(normal) > DEGENERATE:
+                return None
             pose = pose + np.linalg.solve(normal, np.einsum("kai,ka,ka->i", H, 1 / R, nu))
         misfit = float((nu**2 / R).sum())
         if not misfit <= chi2_quantile(self.robot.gate, 2 * len(rows) - 3):

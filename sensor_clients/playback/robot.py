@@ -48,7 +48,7 @@ class Robot:
     share_range: float = 0.04
     sigma_bearing: float = 0.01
     sigma_cross: float = 0.02
-    correlated: float = 10.0
+    correlated: float = 5.0
     scale: float = 0.1
     walk: float = 0.02
     turn_walk: float = 0.016
@@ -96,7 +96,7 @@ SOURCES = {
     "share_range": CAMERA,
     "sigma_bearing": CAMERA,
     "sigma_cross": CAMERA,
-    "correlated": f"{CAMERA}: its autocorrelation, summed over the lags",
+    "correlated": f"{CAMERA}: a third to a half left after 5 s",
     "scale": "chosen: what odometry without calibration may be wrong by",
     "walk": "innovations of landmarks not seen for long agree with it (NIS), no truth needed",
     "turn_walk": ODOMETRY,

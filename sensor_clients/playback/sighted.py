@@ -128,9 +128,7 @@ class Others:
         track.time = max(time, track.time)
 
     def _update(self, track: _Track, prediction: Prediction) -> None:
-        track.mean, track.covariance = update(
-            track.mean, track.covariance, prediction, np.ones((1, 1)), np.zeros(1)
-        )
+        track.mean, track.covariance = update(track.mean, track.covariance, prediction, np.ones((1, 1)), np.zeros(1))
 
 
 def _positive(matrix: Floats) -> Floats:

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from fusion_service.cli import main
-from fusion_service.config import ConfigError, load_config
+from fusion_service.config import ConfigError, centre_config, load_config
 from fusion_service.demo import DemoError, plan_mission, run_demo
 from fusion_service.demo import run as run_module
 from fusion_service.errors import DataError, UsageError
@@ -171,6 +171,9 @@ def test_bad_values_of_options_are_bad_usage(arguments: tuple[str, ...], capsys:
         ("three-radars", {"cameras": True}, "--cameras goes with"),
         ("autoferry:2", {"tracker": "imm"}, "--tracker goes with"),
         ("autoferry:2", {}, "--data or in FUSION_DATA"),
+        ("mrclam:6", {}, "--data or in FUSION_DATA"),
+        ("mrclam:6", {"cameras": True}, "--cameras goes with"),
+        ("mrclam:6", {"tracker": "imm"}, "--tracker goes with"),
     ],
 )
 def test_what_is_no_mission_is_bad_usage(
@@ -191,6 +194,18 @@ def test_the_data_may_stand_in_a_folder_of_their_name(tmp_path: Path) -> None:
     for given in (tmp_path, inside):
         plan = plan_mission("autoferry:2", data=str(given))
         assert str(inside) in plan.clients["lidar"]
+
+
+def test_each_robot_is_two_clients(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no 6/landmarks\.csv in"):
+        plan_mission("mrclam:6", data=str(tmp_path))
+    (tmp_path / "6").mkdir()
+    (tmp_path / "6" / "landmarks.csv").touch()
+    plan = plan_mission("mrclam:6", data=str(tmp_path))
+    robots = {f"robot{n}{suffix}" for n in range(1, 6) for suffix in ("", "-self")}
+    assert set(plan.clients) == {*robots, "truth"}
+    assert plan.cutoff == plan.settings(1.0)["period"] == 1.0
+    centre_config(plan.settings(1.0))
 
 
 @pytest.mark.skipif("FUSION_DATA" not in os.environ, reason="set FUSION_DATA to the folder of the Autoferry recordings")

@@ -82,6 +82,8 @@ def test_a_signal_ends_the_wait_for_a_hub() -> None:
         (["playback", "autoferry:2", "--sensor", "lidar"], "--data DIR or set FUSION_DATA"),
         (["playback", "radar", "--sensor", "radar"], "radar-v2x"),
         (["playback", "radar-v2x", "--sensor", "radar"], "--data DIR or set FUSION_DATA"),
+        (["playback", "mrclam:7", "--sensor", "robot1"], "known: autoferry:2"),
+        (["playback", "mrclam:6", "--sensor", "robot1"], "MR.CLAM sets, or one above it"),
     ],
 )
 def test_bad_usage_is_2_and_says_how_to_mend_it(
@@ -121,6 +123,7 @@ def test_list_names_every_parameter_with_its_source(capsys: pytest.CaptureFixtur
     for row in world.PARAMETERS:
         assert any(row.name in line and row.source in line for line in out.splitlines())
     assert "autoferry:N" in out
+    assert "mrclam:N" in out
 
 
 def test_help_has_examples() -> None:
