@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.align import predict_tracks, write_back
 from fusion_service.centre.centre import Centre
-from fusion_service.centre.correlation import declared_correlation
+from fusion_service.centre.correlation import declared_correlation, declared_motions, sound_rows
+from fusion_service.centre.derived import Derived, Followed, Successive
 from fusion_service.centre.existence import Entries, update_existence
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.lifecycle import Picture, Support
@@ -19,8 +20,11 @@ from fusion_service.centre.linking import Linker
 from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.shared_noise import SharedNoise
 from fusion_service.centre.sources import relinked
 from fusion_service.config import CentreConfig
+from fusion_service.config.correlation import is_derived
+from schemas import Entry
 
 __all__ = ["FusionCentre"]
 
@@ -40,28 +44,46 @@ class FusionCentre(Centre):
     def _begin(self) -> None:
         self._linker = Linker(self.config, self._ids)
         self._entries = Entries()
+        self._derived = Derived(len(self.config.space))
         self._last = -1
 
     def _kept(self) -> dict[str, Any]:
-        return {**self._linker.packed(), "entries": self._entries.packed()}
+        kept = {**self._linker.packed(), "entries": self._entries.packed()}
+        return kept | ({"derived": [self.config_hash, self._derived.packed()]} if len(self._derived) else {})
 
     def _restore(self, state: dict[str, Any]) -> None:
         self._linker.restore(state)
         self._entries = Entries.unpacked(state["entries"])
+        if "derived" in state and state["derived"][0] == self.config_hash:
+            self._derived.restore(state["derived"][1])
         self._last = self._time
 
     def _rebase(self, time: int) -> None:
         self._linker.merges.rebase(time)
+        self._derived = Derived(len(self.config.space))
         self._last = min(self._last, time)
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         now = self._associate(rows, names, time)
-        self._picture, influence = fuse_all(
-            rows, now, time, declared_correlation(self._intake, self.config), self._journal
-        )
+        known = declared_correlation(self._intake, self.config, self._followed(rows, names, time))
+        self._picture, influence = fuse_all(rows, now, time, known, self._journal)
         self._live(rows, time)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
+
+    def _versions(self, rows: Rows) -> Successive | None:
+        """The versions that the rows have gone through since the last step; None: they are not followed."""
+        return None
+
+    def _followed(self, rows: Rows, names: tuple[str, ...], time: int) -> Followed | None:
+        versions = self._versions(rows) if is_derived(self.config.rule, self.config.rule_options) else None
+        if versions is None:
+            return None
+        noise = SharedNoise(declared_motions(self._intake), self.config.space)
+        followed = self._derived.follow(rows, names, versions, noise, sound_rows(rows), time)
+        if self._derived.beyond:
+            self._journal.refuse(Entry("", 0, 0, 0, "too-many-pairs", self._derived.beyond))
+        return followed
 
     def _forget(self, tracks: Iterable[int]) -> None:
         self._relink(dict.fromkeys(tracks, 0))
