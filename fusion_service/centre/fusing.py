@@ -18,7 +18,7 @@ from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
-from fusion_service.centre.correlation import Correlation
+from fusion_service.centre.correlation import Correlation, Ways
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
@@ -54,12 +54,13 @@ def fuse_all(
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
     chosen = np.flatnonzero(used)
     mean, covariance, lineage = picture.mean.copy(), picture.covariance.copy(), picture.lineage.copy()
+    way = picture.way.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
     done: list[Ints] = []
     for ids, groups in by_size(tracks.link[chosen]):
         at, members = picture.find(ids), chosen[groups]
-        one, spread, gains = _gaussian(rows, members, known, journal)
+        one, spread, gains, by = _gaussian(rows, members, known, journal)
         parts, several = _as_mixtures(rows, members, config)
         if parts is not None:
             one[:, several], spread[:, :, several] = parts.moments()
@@ -68,44 +69,47 @@ def fuse_all(
             old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
                 _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound)
-        mean[:, at], covariance[:, :, at], state_time[at] = one, spread, time
+        mean[:, at], covariance[:, :, at], state_time[at], way[at] = one, spread, time, by
         lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory != "restart")
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
-    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage)
+    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
     return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
-def _gaussian(rows: Rows, members: Ints, known: Correlation, journal: Journal) -> tuple[Floats, Floats, Floats]:
+def _gaussian(rows: Rows, members: Ints, known: Correlation, journal: Journal) -> tuple[Floats, Floats, Floats, Ways]:
+    """Means, covariances and gains of groups (B, k), and what each was fused by (see `Correlation.fuse`)."""
     config = known.config
     means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
     covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
     related = kinship.is_related(rows, members) & (config.rule not in kinship.ANY_CORRELATION)
+    by = np.zeros(len(members), dtype=np.uint8)
     if related.all():
         one, spread, gains = _of_kin(rows, members, means, covariances, known)
     else:
         weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
-        fused = known.fuse(rows, members, means, covariances, weights)
+        fused, by = known.fuse(rows, members, means, covariances, weights)
         one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
         if related.any():
             some = _of_kin(rows, members[related], means[..., related], covariances[..., related], known)
-            one[:, related], spread[:, :, related], gains[:, related] = some
+            one[:, related], spread[:, :, related], gains[:, related], by[related] = *some, 0
     bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
     if bad.any():
         one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
         gains[:, bad] = 1.0 / len(means)
         journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
-    return one, spread, gains
+    return one, spread, gains, by
 
 
 def _of_kin(
     rows: Rows, members: Ints, means: Floats, covariances: Floats, known: Correlation
 ) -> tuple[Floats, Floats, Floats]:
-    """Groups whose rows have data in common (see `kinship`)."""
+    """Groups whose rows have data in common (see `kinship`): what is derived of them holds for no result of them."""
+    known = replace(known, followed=None)
 
     def by_rule(means: Floats, covariances: Floats, which: list[int], some: Ints) -> kinship.Estimates:
-        fused = known.fuse(rows, members[some][:, which], means, covariances, None)
+        fused, _ = known.fuse(rows, members[some][:, which], means, covariances, None)
         return kinship.Estimates(fused.mean, fused.covariance, np.nan_to_num(_influence(fused)))
 
     return kinship.fuse_related(means, covariances, kinship.common(rows, members), by_rule)

@@ -21,8 +21,11 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.sources import Source
 from fusion_service.centre.stated_registration import shift_of
 
-__all__ = ["Record", "Watch", "reason_of"]
+__all__ = ["INNOVATIONS", "WATCHED", "Record", "Watch", "reason_of"]
 
+INNOVATIONS = "innovations"
+WATCHED = ("", INNOVATIONS, "registration", "covariance_floor")
+"""Reasons, of those whose increments are what the tracker has measured all the same."""
 REMEMBERED = 2000.0
 """Degrees of freedom that a sum holds about; older ones fade."""
 SIGMAS = 3.3
@@ -86,8 +89,8 @@ class Watch:
         changed = []
         for name, record in self.records.items():
             reason = reason_of(intake, intake.sources[name])
-            if not reason and record.fails:
-                reason = "innovations"
+            if reason in WATCHED and record.fails:
+                reason = INNOVATIONS
             if reason != record.reason and (reason or record.versions):
                 changed.append({"kind": "tracklets", "source": name, "why": reason, "ratio": round(record.ratio, 4)})
             record.reason = reason

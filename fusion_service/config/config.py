@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
-from fusion_service.config.correlation import rule_options
+from fusion_service.config.correlation import is_derived, rule_options
 from fusion_service.config.readers import (
     DURATION,
     POSITIVE,
@@ -190,7 +190,17 @@ class CentreConfig:
     @property
     def follows(self) -> bool:
         """Whether successive versions of local tracks are used, not only the newest."""
-        return self.memory == "tracklet"
+        return self.by_tracklets or self.by_derived
+
+    @property
+    def by_tracklets(self) -> bool:
+        """Whether filters of the targets' own take tracklets, where they are sound."""
+        return self.memory == "tracklet" or self.rule == "auto"
+
+    @property
+    def by_derived(self) -> bool:
+        """Whether cross-covariances of local tracks are derived."""
+        return self.rule == "auto" or is_derived(self.rule, self.rule_options)
 
     def source(self, name: str) -> SourceConfig:
         """The settings of one source: its own, or the defaults."""

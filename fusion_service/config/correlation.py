@@ -104,6 +104,13 @@ def tried(rule: str, options: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         if options.get("cross") != DERIVED:
             raise ValueError(f'{rule} needs rule_options = {{cross = "{DERIVED}"}}, not {options.get("cross")!r}')
         return "bci", {}
+    if rule == "auto":
+        for key in options:
+            if key not in ("max_correlation", "criterion"):
+                raise ValueError(f"auto has no option {key!r} (known: criterion, max_correlation)")
+        if "max_correlation" in options and group_bounds(options) is None:
+            raise ValueError("auto takes max_correlation as a table of bounds between groups")
+        return "bci", {key: value for key, value in options.items() if key == "criterion"}
     few = dict(options)
     if rule == "bci" and (few.get("max_correlation") == DERIVED or group_bounds(options) is not None):
         few["max_correlation"] = 1.0
