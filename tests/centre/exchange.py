@@ -8,7 +8,7 @@ centre is given the reports of its sensors and the pictures that the others made
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -55,7 +55,8 @@ class Sensor:
 
 @dataclass
 class Network:
-    """Centres by name, each with sensors of its own, and whom each of them hears."""
+    """Centres by name, each with sensors of its own, and whom each of them hears. told: pictures go with their lineage.
+    alive (targets,): the sensors have a track of it; coasting: they go on listing those that they lost."""
 
     hears: Mapping[str, Sequence[str]]
     sigmas: Mapping[str, Sequence[tuple[float, float]]]
@@ -63,6 +64,7 @@ class Network:
     q: float = 1.0
     seed: int = 1
     exchange: bool = True
+    told: bool = True
     config: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -71,6 +73,8 @@ class Network:
         grid = 20_000.0 * np.stack(np.divmod(np.arange(self.targets), side), axis=1)
         self.states = np.concatenate([grid, self.rng.normal(0, 10, (self.targets, 2))], axis=1)
         self.second = 0
+        self.coasting = False
+        self.lost = START
         self.alive = np.ones(self.targets, dtype=np.bool_)
         self.centres: dict[str, FusionCentre] = {}
         self.sensors: dict[str, Sensor] = {}
@@ -79,14 +83,14 @@ class Network:
         start = np.diag([100.0, 100.0, 25.0, 25.0])
         for name, others in self.hears.items():
             listened = {f"global/{one}": {} for one in others} if self.exchange else {}
-            motion = {"kind": "cv", "q": self.q}
             given = {"name": name, "lateness": 3.0, "motion": schemas.Motion("cv", self.q), "sources": listened}
-            assert motion["kind"] == "cv"
             self.centres[name] = FusionCentre({**given, **self.config})
             for k, sigma in enumerate(self.sigmas[name]):
                 source = f"{name}{k}"
                 noise = self.rng.multivariate_normal(np.zeros(4), start, self.targets)
-                self.sensors[source] = Sensor(np.array(sigma), self.states + noise, np.tile(start, (self.targets, 1, 1)))
+                self.sensors[source] = Sensor(
+                    np.array(sigma), self.states + noise, np.tile(start, (self.targets, 1, 1))
+                )
                 said = info(source, motion=schemas.Motion("cv", self.q))
                 self.centres[name].handle(said, START)
 
@@ -103,7 +107,7 @@ class Network:
                 centre.handle(self._report(f"{name}{k}", now), now)
             for other in self.hears[name] if self.exchange else ():
                 if other in self.pictures:
-                    centre.handle(schemas.decode(schemas.encode(self.pictures[other])), now)
+                    centre.handle(self._picture(other), now)
             result = centre.step(now)
             made[name] = result.tracks
             self.lengths[name].append(len(result.tracks.ids))
@@ -111,8 +115,15 @@ class Network:
         self.pictures = made
         return made
 
+    def _picture(self, name: str) -> schemas.Message:
+        picture = self.pictures[name]
+        if not self.told:
+            picture = replace(picture, lineage=None, track_lineage=None)
+        return schemas.decode(schemas.encode(picture))
+
     def _report(self, source: str, now: int) -> schemas.LocalTracks:
-        sensor = self.sensors[source]
+        sensor, shown = self.sensors[source], self.alive | self.coasting
+        updated = np.where(self.alive, now, self.lost)
         return schemas.LocalTracks(
             source=source,
             epoch=1,
@@ -122,9 +133,10 @@ class Network:
             complete=True,
             space=SPACE,
             frame=FRAME,
-            ids=np.flatnonzero(self.alive).astype(np.uint64) + np.uint64(1),
-            means=sensor.mean[self.alive],
-            covariances=sensor.covariance[self.alive],
+            ids=np.flatnonzero(shown).astype(np.uint64) + np.uint64(1),
+            means=sensor.mean[shown],
+            covariances=sensor.covariance[shown],
+            updated=updated[shown],
         )
 
     def errors(self, picture: schemas.GlobalTracks) -> tuple[Floats, Floats]:

@@ -85,6 +85,7 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
                 kind=[None, "ship"],
                 kind_p=[0, 1],
                 height=Height(5.0, 2.0),
+                lineages=[["b"], ["a", "b"]],
             )
         )
         radar.intensity(time=5, space=["x", "y"], frame=SITE, weights=[1.5], means=[[1, 2]], covariances=[np.eye(2)])
