@@ -105,6 +105,9 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
     assert (info.position, info.period, info.coverage) == ((1.0, 2.0, 3.0), 2.0, Disk(1e4))
     full, empty = by_key[prefix + "tracks"]
     assert isinstance(full, LocalTracks)
+    assert full.track_lineage is not None
+    assert full.track_lineage.tolist() == [[0b10], [0b11]]
+    assert isinstance(full, LocalTracks)
     assert isinstance(empty, LocalTracks)
     assert full.ids.tolist() == [7, 9]
     assert full.means.tolist() == [[1, 2, 3, 4], [5, 6, 7, 8], [9, 10, 11, 12]]

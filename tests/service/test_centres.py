@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -126,21 +125,20 @@ def centres(request: pytest.FixtureRequest, hub: Hub, tmp_path: Path) -> Iterato
         realm = {"A": ("C",), "B": ("A",), "C": ("B",)}
     with ExitStack() as stack:
         made = Centres(hub, tmp_path, stack, realm)
-        made.tree = request.param == "tree"  # type: ignore[attr-defined]
         yield made
 
 
 def test_three_centres_over_processes(centres: Centres) -> None:
     """In a tree the top has what both branches see; in a ring all have all; all are honest; and nothing outlives its
     sensors."""
-    tree: bool = centres.tree  # type: ignore[attr-defined]
+    tree = "top" in centres.services
     if tree:
         eventually(lambda: centres.pictures["top"] and set(_in_all(centres.pictures["top"][-1])) >= {"sA", "sB"}, 20)
         eventually(lambda: set(centres.counts().values()) == {TARGETS}, 10)
     else:
         eventually(centres.complete, 20)
     begin = {name: len(some) for name, some in centres.pictures.items()}
-    time.sleep(4.0)
+    eventually(lambda: all(len(some) >= begin[name] + 20 for name, some in centres.pictures.items()), 10)
     for name, some in centres.pictures.items():
         fresh = [picture for picture in some[begin[name] :] if len(picture.ids) == TARGETS]
         assert len(fresh) >= 10, (name, len(fresh), len(some) - begin[name])
