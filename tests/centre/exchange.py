@@ -82,7 +82,7 @@ class Network:
         self.lengths: dict[str, list[int]] = {name: [] for name in self.hears}
         start = np.diag([100.0, 100.0, 25.0, 25.0])
         for name, others in self.hears.items():
-            listened = {f"global/{one}": {} for one in others} if self.exchange else {}
+            listened: dict[str, Any] = {f"global/{one}": {} for one in others} if self.exchange else {}
             given = {"name": name, "lateness": 3.0, "motion": schemas.Motion("cv", self.q), "sources": listened}
             self.centres[name] = FusionCentre({**given, **self.config})
             for k, sigma in enumerate(self.sigmas[name]):

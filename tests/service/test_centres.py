@@ -99,7 +99,7 @@ def _in_all(picture: GlobalTracks) -> list[str]:
     assert picture.lineage is not None
     assert picture.track_lineage is not None
     bits = np.unpackbits(picture.track_lineage, axis=1, count=len(picture.lineage), bitorder="little")
-    return [name for name, there in zip(picture.lineage, bits.all(axis=0).tolist(), strict=True) if there]
+    return [picture.lineage[k] for k in np.flatnonzero(bits.all(axis=0)).tolist()]
 
 
 def worst(pictures: Sequence[GlobalTracks]) -> tuple[float, float, float]:
