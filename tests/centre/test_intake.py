@@ -47,7 +47,7 @@ HOSTILE = {
     "future epoch": (broken(epoch=2**64 - 1), "future", 1),
     "late": (broken(time=START - 10 * SECOND), "late", 1),
     "space": (broken(space=("x", "y", "z", "vz")), "space", 1),
-    "loop": (broken(lineage=("r9", "centre")), "loop", 1),
+    "loop": (broken(source="global/centre"), "loop", 1),
     "own name": (broken(source="centre"), "loop", 1),
     "other frame": (broken(frame=schemas.Local("dock")), "frame", 3),
     "bad period": (info("r1", seq=5, period=-1.0), "bad-info", 1),

@@ -146,6 +146,8 @@ class _Parts:
         for name in _LABELS:
             if (column := getattr(picture, name)) is not None:
                 yield name.replace("_", " "), column[row] if isinstance(column, tuple) else column[row].item()
+        if picture.track_lineage is not None:
+            yield "lineage", picture.track_lineage[row].tobytes().hex()
         some = slice(self.contributions[row], self.contributions[row + 1])
         who = [
             (picture.sources[source], epoch, track)
