@@ -10,6 +10,7 @@ every source by the existence it reports. With recursive memory the predicted la
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +18,15 @@ from numpy.typing import NDArray
 from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.association import by_size, uniform_ci
+from fusion_service.centre.blocks import fuse_known
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import no_parts, padded
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures, reduce_mixtures
-from fusion_service.rules import Fused, fuse_last
+from fusion_service.rules import MIXTURE_RULES, RULES, Fused, fuse_last
 from fusion_service.rules.mixtures import fuse_mixtures_last
 from schemas import Entry
 
@@ -51,16 +54,17 @@ def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, jour
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
     done: list[Ints] = []
+    unknown = Unknown.of(config.space)
     for ids, groups in by_size(tracks.link[chosen]):
         at, members = picture.find(ids), chosen[groups]
-        one, spread, gains = _gaussian(rows, members, config, journal)
-        parts, several = _as_mixtures(rows, members, config)
+        one, spread, gains = _gaussian(rows, members, config, unknown, journal)
+        parts, several = _as_mixtures(rows, members, config, unknown)
         if parts is not None:
             one[:, several], spread[:, :, several] = parts.moments()
             mixed.append((at[several], parts))
         if config.memory == "recursive":
             old = np.flatnonzero(picture.time[at] >= 0)
-            _remember(one, spread, gains, picture, at, old, config)
+            _remember(one, spread, gains, picture, at, old, config, unknown)
         mean[:, at], covariance[:, :, at], state_time[at] = one, spread, time
         influence[members] = gains.T
         done.append(at)
@@ -69,28 +73,48 @@ def fuse_all(rows: Rows, picture: Picture, time: int, config: CentreConfig, jour
     return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
-def _gaussian(rows: Rows, members: Ints, config: CentreConfig, journal: Journal) -> tuple[Floats, Floats, Floats]:
+def _gaussian(
+    rows: Rows, members: Ints, config: CentreConfig, unknown: Unknown, journal: Journal
+) -> tuple[Floats, Floats, Floats]:
     means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
     covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
     weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
-    fused = fuse_last(config.rule, means, covariances, weights, influence=True, **config.rule_options)
-    one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
-    bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
-    if bad.any():
-        one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
-        gains[:, bad] = 1.0 / len(means)
-        journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
-    return one, spread, gains
+
+    def rule(x: Floats, P: Floats, w: Floats | None, components: Ints, _: Ints) -> tuple[Floats, Floats, Floats]:
+        fused = fuse_last(config.rule, x, P, w, influence=True, **_options(config, components))
+        one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+        bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
+        if bad.any():
+            one[:, bad], spread[:, :, bad] = uniform_ci(x[:, :, bad], P[:, :, :, bad])
+            gains[:, bad] = 1.0 / len(x)
+            journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
+        return one, spread, gains
+
+    return fuse_known(means, covariances, weights, unknown, RULES[config.rule].information, rule)
 
 
-def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtures | None, NDArray[np.bool_]]:
-    """The fused mixtures of the groups where a member is one, and which groups these are."""
+def _options(config: CentreConfig, components: Ints) -> dict[str, Any]:
+    """The options of the rule for these components of the space."""
+    scales = config.rule_options.get("scales")
+    if scales is None or len(components) == len(config.space):
+        return config.rule_options
+    return {**config.rule_options, "scales": np.asarray(scales, dtype=np.float64)[components]}
+
+
+def _as_mixtures(
+    rows: Rows, members: Ints, config: CentreConfig, unknown: Unknown
+) -> tuple[Mixtures | None, NDArray[np.bool_]]:
+    """The fused mixtures of the groups where a member is one, and which groups these are; not of those whose members do
+    not know the same, by a mixture rule that is not in information form."""
     components = np.isfinite(rows.tracks.log_weight).sum(axis=0) if len(rows.tracks.log_weight) else None
     several = np.zeros(len(members), dtype=np.bool_)
     alone = members.shape[1] == 1
     if components is None or config.memory == "recursive" or (config.mixture_rule == "moments" and not alone):
         return None, several
     several = (components[members] > 1).any(axis=1)
+    if not alone and not (MIXTURE_RULES.get(config.mixture_rule) or RULES[config.mixture_rule]).information:
+        known = unknown.known(rows.tracks.covariance[:, :, members])
+        several &= (known == known[:, :, :1]).all(axis=(0, 2))
     if not several.any():
         return None, several
     sources = [rows.tracks.mixtures(members[several, j]) for j in range(members.shape[1])]
@@ -122,22 +146,24 @@ def _shares(rows: Rows, members: Ints) -> Floats:
 
 
 def _remember(
-    one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, config: CentreConfig
-) -> None:
+    one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, config: CentreConfig,
+    unknown: Unknown,
+) -> None:  # fmt: skip
     """Fuse the result of the local tracks with the predicted last one, where there is one."""
     if not len(old):
         return
-    again = fuse_last(
-        "bci",
-        np.stack([one[:, old], picture.mean[:, at[old]]]),
-        np.stack([spread[:, :, old], picture.covariance[:, :, at[old]]]),
-        influence=True,
-        max_correlation=config.memory_correlation,
-    )
-    good = linalg.is_positive_definite(again.covariance) & np.isfinite(again.mean).all(axis=0)
+
+    def rule(x: Floats, P: Floats, _w: Floats | None, _c: Ints, _e: Ints) -> tuple[Floats, Floats, Floats]:
+        again = fuse_last("bci", x, P, influence=True, max_correlation=config.memory_correlation)
+        return again.mean, again.covariance, _influence(again)
+
+    means = np.stack([one[:, old], picture.mean[:, at[old]]])
+    covariances = np.stack([spread[:, :, old], picture.covariance[:, :, at[old]]])
+    mean, covariance, shares = fuse_known(means, covariances, None, unknown, True, rule)
+    good = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
     kept = old[good]
-    one[:, kept], spread[:, :, kept] = again.mean[:, good], again.covariance[:, :, good]
-    gains[:, kept] *= _influence(again)[0][good]
+    one[:, kept], spread[:, :, kept] = mean[:, good], covariance[:, :, good]
+    gains[:, kept] *= shares[0][good]
 
 
 def _with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]]) -> Picture:

@@ -91,7 +91,8 @@ class FusionCentre(Centre):
     def _predicted(self, time: int) -> Picture:
         picture, config = self._picture, self.config
         dt = np.where(picture.time >= 0, time - picture.time, 0) / 1e9
-        return predict_tracks(picture, config.motion, config.space, config.space, dt)
+        age = np.maximum(picture.time - picture.seen, 0) / 1e9
+        return predict_tracks(picture, config.motion, config.space, config.space, dt, config.unknown_speed, age)
 
     def _live(self, rows: Rows, time: int) -> None:
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()

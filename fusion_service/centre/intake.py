@@ -321,7 +321,7 @@ class Intake:
             return "" if is_sound(message) else "bad-info"
         if last >= 0 and holds < last - round(self.config.lateness * 1e9):
             return "late"
-        if not set(self.config.space) <= set(message.space):
+        if self.config.kind == "intensity" and not set(self.config.space) <= set(message.space):
             return "space"
         if isinstance(message, LocalIntensity) is not (self.config.kind == "intensity"):
             return "intensity" if isinstance(message, LocalIntensity) else "tracks"

@@ -72,6 +72,7 @@ RULE = Rule(
     promise="optimal (linear) for the cross-covariance given",
     source="Bar-Shalom and Campo 1986; two sources",
     fuse=bar_shalom_campo,
+    information=True,
     n_way=False,
     takes={"cross_covariance": Option(None, _cross, per_element=True)},
     takes_weights=False,

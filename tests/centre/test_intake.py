@@ -46,7 +46,6 @@ HOSTILE = {
     "future": (broken(time=START + 10**8 * SECOND), "future", 1),
     "future epoch": (broken(epoch=2**64 - 1), "future", 1),
     "late": (broken(time=START - 10 * SECOND), "late", 1),
-    "space": (broken(space=("x", "y", "z", "vz")), "space", 1),
     "loop": (broken(lineage=("r9", "centre")), "loop", 1),
     "own name": (broken(source="centre"), "loop", 1),
     "other frame": (broken(frame=schemas.Local("dock")), "frame", 3),
