@@ -43,7 +43,9 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         if source.muted or not intake.ready(source):
             leave_out(source)
             continue
-        predicted = predict_tracks(table, said.motion, source.space, config.space, (time - table.time) / 1e9, config.unknown_speed)
+        predicted = predict_tracks(
+            table, said.motion, source.space, config.space, (time - table.time) / 1e9, config.unknown_speed
+        )
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):

@@ -12,7 +12,8 @@ A rule is never shown a component that none of its sources has. Of the others
 
   With x_R = x'_R + B (x_C - x'_C), B = P'_RC P'_CC^-1 of p_T:  P_RR = P'_RR - B P'_CR + B P_CC B', P_RC = B P_CC.
   Sets come largest first, and R is placed beside all components that are placed and that every source of T knows; of
-  the rest it is independent given these. For the product of the densities this is the product itself.
+  the rest it is independent given these. What the sources of T say of C through R is left where it is: in C all sources
+have their say once. (Where one source alone tells R, this of the naive rule is the product of the densities.)
 
 The influence of a source is its share in each block it is in, by the size of the block.
 """
@@ -61,7 +62,7 @@ def fuse_known(
 def _kinds(known: Bools, information: bool) -> Iterator[tuple[Bools, Ints]]:
     """The elements (some of B,) of `known` (n, N, B) by what their sources know (n, N); for a rule in information form
     by what any of them does (n, 1)."""
-    n, N, count = known.shape
+    n, _, count = known.shape
     seen = known.any(axis=1, keepdims=True) if information else known
     kinds, which = np.unique(seen.reshape(-1, count), axis=1, return_inverse=True)
     for number, kind in enumerate(kinds.T):

@@ -79,7 +79,7 @@ def find_candidates(
     source = np.concatenate([np.full(len(known), -1), rows.source[loose]])
     compartment = np.concatenate([meeting.compartment_of_tracks[known], meeting.compartment_of_rows[loose]])
     gates = np.concatenate([np.tile(tests.gate[:, None], len(known)), rows.gate[:, loose]], axis=1)
-    seen = tests.unknown.known(covariances).all(axis=1)
+    seen = np.asarray(tests.unknown.known(covariances).all(axis=1))
     places = [place for place in places if seen[place]]  # where a height is not known, pairs are sought on the plane
     sigma = np.sqrt(sum(covariances[place, place] for place in places))
     i, j = candidate_pairs(means[places], sigma, float(np.sqrt(gates.max(initial=tests.gate[-1]))), source)

@@ -115,9 +115,7 @@ def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensu
     return Consensus(labels, mean, covariance, others_mean, others_covariance, size)
 
 
-def _from_prediction(
-    rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings
-) -> tuple[Floats, Ints]:
+def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings) -> tuple[Floats, Ints]:
     """d2 (L,) of each linked row to the prediction of its global track, a manoeuvre allowed for, and over how many
     components that is."""
     tracks = rows.tracks

@@ -22,6 +22,7 @@ from fusion_service.centre.clock import horizon
 from fusion_service.centre.declared import declared_by, loosened, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
+from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.orders import Orders
@@ -375,8 +376,9 @@ class Intake:
             try:
                 if self.frame is None:
                     raise FrameError(notes.unfit(name_frame(first.frame), self.config.space))
+                messages = [with_height(one, said.height, self.frame, self.config.space) for one in messages]
                 new = message_tracks(messages, sound, self.frame, said.height, self.config.max_components, self.said)
-                new = loosened(new, first.space, said)
+                new = loosened(new, messages[0].space, said)
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))
             else:

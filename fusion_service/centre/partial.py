@@ -2,7 +2,7 @@
 
 The picture has one state space; a source may tell less of it: places without velocity, a plane without height. What is
 missing stands in a row, or a global track, as **padding**: mean 0, no correlation, and a sigma (`SIGMA`) so large that
-it is no information to any rule in information form (its share in that of a known component is below 1e-9). A
+it is no information to any rule in information form (what it takes from a known component is below 1e-9 of that). A
 component is unknown exactly where its variance is `UNKNOWN_FROM` of the padding's or more, whoever has put it there, so
 nothing else has to be remembered of it: two densities have in common what the sum of their covariances knows. x and y
 are always known.
@@ -24,20 +24,21 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.geodesy import transform
 from fusion_service.motion import predict
-from schemas import Motion
+from schemas import Frame, Height, Motion
 
-__all__ = ["SIGMA", "Unknown", "apart", "brought", "patterns", "predict_known"]
+__all__ = ["SIGMA", "Unknown", "apart", "brought", "patterns", "predict_known", "transformed"]
 
 SIGMA = {
     **dict.fromkeys(("x", "y"), np.inf),
-    "z": 1e7,
-    **dict.fromkeys(("vx", "vy", "vz"), 1e5),
-    **dict.fromkeys(("ax", "ay", "az"), 1e5),
-    "turn_rate": 1e3,
+    "z": 1e9,
+    **dict.fromkeys(("vx", "vy", "vz"), 1e7),
+    **dict.fromkeys(("ax", "ay", "az"), 1e7),
+    "turn_rate": 1e5,
 }
 """Of a component that is not known: m, m/s, m/s2, rad/s. Of x and y, which always are, without meaning."""
-UNKNOWN_FROM = 0.1
+UNKNOWN_FROM = 1e-3
 """Of that sigma: what is vaguer says nothing."""
 PLAUSIBLE_HEIGHT = 1e4
 PLAUSIBLE_TURN = 0.3
@@ -66,10 +67,20 @@ class Unknown:
         plausible = np.array([likely[name] for name in space])
         return cls(space, (UNKNOWN_FROM * sigma) ** 2, sigma**2, plausible**2)
 
-    def known(self, covariance: Floats) -> Bools:
+    def known(self, covariance: Floats) -> NDArray[np.bool_]:
         """Which components (n, ...) of densities with `covariance` (n, n, ...) are known."""
         variance = np.moveaxis(np.diagonal(covariance), -1, 0)
-        return np.asarray(~(variance >= self.limit.reshape(-1, *(1,) * (variance.ndim - 1))))
+        limit: Floats = self.limit.reshape(-1, *(1,) * (variance.ndim - 1))
+        return np.logical_not(np.greater_equal(variance, limit))
+
+    def shared(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
+        """Densities (n, B, N) and (n, n, B, N) of which those of an element are alike (0 +- 1, on its own) in each
+        component that one of its N does not know."""
+        both = np.asarray(self.known(covariances).all(axis=-1, keepdims=True))
+        alike = np.where(both[:, None] & both[None], covariances, 0.0)
+        diagonal = range(len(means))
+        alike[diagonal, diagonal] = np.where(both, alike[diagonal, diagonal], 1.0)
+        return np.where(both, means, 0.0), alike
 
     def common(self, spread: Floats) -> tuple[Ints, Floats]:
         """Of pairs with the sum of covariances `spread` (n, n, K): how many components both know (K,), and what to add
@@ -143,6 +154,30 @@ def predict_known(
                 k = names.index(place)
                 spread[k, k] += speed**2 * gone * (gone + 2.0 * since)
         out_mean[..., at], out_covariance[..., at] = brought(moved.reshape(shape), spread, names, unknown)
+    return out_mean, out_covariance
+
+
+def transformed(
+    means: Floats,
+    covariances: Floats,
+    space: tuple[str, ...],
+    frame: Frame,
+    target: Frame,
+    height: Height | None = None,
+) -> tuple[Floats, Floats]:
+    """`geodesy.transform` of densities (C, n), (C, n, n): what one does not know is left out, and padded again, so that
+    an unknown height spreads over nothing else. Raises `FrameError`."""
+    unknown = Unknown.of(space)
+    known = unknown.known(covariances.transpose(1, 2, 0))
+    if frame == target or known.all():
+        return transform(means, covariances, space, frame, target, height)
+    out_mean, out_covariance = np.zeros_like(means), np.zeros_like(covariances)
+    out_covariance[:, range(len(space)), range(len(space))] = unknown.pad
+    for some, at in patterns(known):
+        names, place, square = tuple(space[k] for k in some.tolist()), np.ix_(at, some), np.ix_(at, some, some)
+        out_mean[place], out_covariance[square] = transform(
+            means[place], covariances[square], names, frame, target, height
+        )
     return out_mean, out_covariance
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from fusion_service.centre import notes
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.sources import Source
@@ -18,9 +19,9 @@ def step_status(
     log: StepLog,
     tracks: dict[str, int],
     refused: dict[str, int],
-    notes: tuple[str, ...] | None = None,
+    told: tuple[str, ...] | None = None,
 ) -> Status:
-    """Status after the step of `log`; tracks: how many there are of each kind; notes: what an operator should know."""
+    """Status after the step of `log`; tracks: how many there are of each kind; told: what an operator should know."""
     return Status(
         source=log.source,
         epoch=log.epoch,
@@ -36,7 +37,7 @@ def step_status(
         sources={name: _health(source, intake, journal, log.time) for name, source in sorted(intake.sources.items())},
         tracks=tracks,
         step_time={},
-        notes=notes,
+        notes=told,
     )
 
 
@@ -54,6 +55,6 @@ def _health(source: Source, intake: Intake, journal: Journal, time: int) -> dict
         "reordered": source.reordered,
         "tracks": len(source.tracks.id),
         "unused": dict(sorted(source.unused.items())),
-        "note": source.why,
+        "note": source.why or notes.partial(source.space, intake.config),
         "refused": dict(sorted(journal.refused_of.get(source.name, {}).items())),
     }

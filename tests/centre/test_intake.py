@@ -235,8 +235,9 @@ def test_a_filler_of_before_the_first_message_mends_no_gap() -> None:
 
 def test_a_track_whose_density_overflows_on_its_way_is_told() -> None:
     made = FusionCentre({"source_defaults": {"period": 1e5}})
-    wild = np.array([1.0, 1.0, 1e11, 1e11])
-    give(made, info("r1", period=1e5), tracks("r1", 1, [[0, 0, 0, 0]], sigma=wild))
+    wild = np.array([1.0, 1.0, 9e3, 9e3])  # vaguer, and the velocity were none
+    told = info("r1", period=1e5, motion=schemas.Motion("cv", 0.0))
+    give(made, told, tracks("r1", 1, [[0, 0, 0, 0]], sigma=wild))
     result = step(made, 2e5)
     assert len(result.tracks.ids) == 0
     assert result.status.refused.get("ill-conditioned", 0) == 1
