@@ -73,6 +73,18 @@ class Unknown:
         limit: Floats = self.limit.reshape(-1, *(1,) * (variance.ndim - 1))
         return np.logical_not(np.greater_equal(variance, limit))
 
+    def told(self, covariance: Floats) -> Floats:
+        """Covariances (n, n, ...) as they are published: padding that is just large enough to be known as such, so that
+        readers lose no more digits by it than they must."""
+        known = self.known(covariance)
+        if known.all():
+            return covariance
+        out, diagonal = covariance.copy(), range(len(covariance))
+        out[diagonal, diagonal] = np.where(
+            known, out[diagonal, diagonal], self.limit.reshape(-1, *(1,) * (known.ndim - 1))
+        )
+        return out
+
     def shared(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
         """Densities (n, B, N) and (n, n, B, N) of which those of an element are alike (0 +- 1, on its own) in each
         component that one of its N does not know."""

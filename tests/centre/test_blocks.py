@@ -41,7 +41,7 @@ class Group:
                 if k not in kind:
                     self.covariances[i, k, k, 0] = SIGMA[SPACE[k]] ** 2
             self.means[i, kind, 0] = self.x[i]
-            self.covariances[np.ix_([i], kind, kind, [0])] = self.P[i][None, :, :, None]
+            self.covariances[i, :, :, 0][np.ix_(kind, kind)] = self.P[i]
 
     def fused(self, name: str, **options: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Mean, covariance, influences and the weights of the last call of the rule."""
@@ -217,7 +217,8 @@ def test_sources_that_know_the_same_are_fused_as_if_there_were_no_more(name: str
 
 def test_kinds_in_one_batch_do_not_touch_each_other() -> None:
     """Bits of an element are the same in any batch, whatever the others know."""
-    groups = [Group(seed, kinds) for seed, kinds in enumerate([[FULL, PLACE], [FLAT, FULL], [PLACE, PLACE]])]
+    several: list[list[tuple[int, ...]]] = [[FULL, PLACE], [FLAT, FULL], [PLACE, PLACE]]
+    groups = [Group(seed, kinds) for seed, kinds in enumerate(several)]
     means = np.concatenate([one.means for one in groups], axis=-1)
     covariances = np.concatenate([one.covariances for one in groups], axis=-1)
     for name in ("ci", "ici"):
