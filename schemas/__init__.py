@@ -21,6 +21,7 @@ from schemas.messages import (
 from schemas.numeric import FAULTS, check_numbers
 from schemas.spaces import (
     COMPONENTS,
+    UNKNOWN_SIGMA,
     Coverage,
     Disk,
     Ecef,
@@ -44,6 +45,7 @@ __all__ = [
     "REALM",
     "REASONS",
     "STATUSES",
+    "UNKNOWN_SIGMA",
     "VERSION",
     "Coverage",
     "Decisions",

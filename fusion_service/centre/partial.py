@@ -3,7 +3,7 @@
 The picture has one state space; a source may tell less of it: places without velocity, a plane without height. What is
 missing stands in a row, or a global track, as **padding**: mean 0, no correlation, and a sigma (`SIGMA`) so large that
 it is no information to any rule in information form (what it takes from a known component is below 1e-9 of that). A
-component is unknown exactly where its variance is `UNKNOWN_FROM` of the padding's or more, whoever has put it there, so
+component is unknown exactly where its sigma is `schemas.UNKNOWN_SIGMA` or more, whoever has put it there, so
 nothing else has to be remembered of it: two densities have in common what the sum of their covariances knows. x and y
 are always known.
 
@@ -26,20 +26,12 @@ from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.geodesy import transform
 from fusion_service.motion import predict
-from schemas import Frame, Height, Motion
+from schemas import UNKNOWN_SIGMA, Frame, Height, Motion
 
 __all__ = ["SIGMA", "Unknown", "apart", "brought", "patterns", "predict_known", "transformed"]
 
-SIGMA = {
-    **dict.fromkeys(("x", "y"), np.inf),
-    "z": 1e9,
-    **dict.fromkeys(("vx", "vy", "vz"), 1e7),
-    **dict.fromkeys(("ax", "ay", "az"), 1e7),
-    "turn_rate": 1e5,
-}
+SIGMA = dict.fromkeys(("x", "y"), np.inf) | {name: 1e3 * sigma for name, sigma in UNKNOWN_SIGMA.items()}
 """Of a component that is not known: m, m/s, m/s2, rad/s. Of x and y, which always are, without meaning."""
-UNKNOWN_FROM = 1e-3
-"""Of that sigma: what is vaguer says nothing."""
 PLAUSIBLE_HEIGHT = 1e4
 PLAUSIBLE_TURN = 0.3
 AXES = (("x", "vx"), ("y", "vy"), ("z", "vz"))
@@ -65,7 +57,8 @@ class Unknown:
         likely |= dict.fromkeys(("ax", "ay", "az"), max(acceleration, 1e-3))
         sigma = np.array([SIGMA[name] for name in space])
         plausible = np.array([likely[name] for name in space])
-        return cls(space, (UNKNOWN_FROM * sigma) ** 2, sigma**2, plausible**2)
+        limit = np.array([UNKNOWN_SIGMA.get(name, np.inf) for name in space])
+        return cls(space, limit**2, sigma**2, plausible**2)
 
     def known(self, covariance: Floats) -> NDArray[np.bool_]:
         """Which components (n, ...) of densities with `covariance` (n, n, ...) are known."""

@@ -11,11 +11,11 @@ import pytest
 import schemas
 from fusion_service.centre import FusionCentre, StepResult, partial
 from fusion_service.centre.evidence import chi2_by_size
-from fusion_service.centre.partial import SIGMA, UNKNOWN_FROM, Unknown, apart, predict_known
+from fusion_service.centre.partial import SIGMA, Unknown, apart, predict_known
 from fusion_service.geodesy import enu_to_geodetic, geodetic_to_ecef, geodetic_to_enu
 from fusion_service.motion import predict
 from fusion_service.rules import RULES
-from schemas import Ecef, Enu, Height, Motion
+from schemas import UNKNOWN_SIGMA, Ecef, Enu, Height, Motion
 from tests.centre.worlds import FRAME, SECOND, SPACE, START, give, info, step, tracks
 from tests.helpers.random_missions import narrowed
 
@@ -47,7 +47,7 @@ def unknown(result: StepResult) -> set[str]:
     """The components that the picture's only track does not know."""
     assert len(result.tracks.ids) == 1
     names = [name for name in result.tracks.space if name not in "xy"]
-    return {name for name in names if np.sqrt(variance(result, name)) >= UNKNOWN_FROM * SIGMA[name]}
+    return {name for name in names if np.sqrt(variance(result, name)) >= UNKNOWN_SIGMA[name]}
 
 
 @pytest.mark.parametrize("rule", [name for name in RULES if name != "bar-shalom-campo"])
