@@ -55,13 +55,15 @@ class Correlation:
     followed: Followed | None = None
 
     def fuse(
-        self, rows: Rows, members: Ints, means: Floats, covariances: Floats, weights: Floats | None
+        self, rows: Rows, members: Ints, means: Floats, covariances: Floats, weights: Floats | None, some: Ints
     ) -> tuple[Fused, Ways]:
-        """Fuse rows `members` (B, N), of means (N, n, B) and covariances (N, n, n, B); what cannot be fused is NaN.
-        And what each was fused by (B,): index into `lifecycle.WAYS`."""
+        """Fuse rows `members` (B, N), of means (N, m, B) and covariances (N, m, m, B) of the components `some` (m,) of
+        the space; what cannot be fused is NaN. And what each was fused by (B,): index into `lifecycle.WAYS`."""
         rule, options = self.config.rule, dict(self.config.rule_options)
+        if "scales" in options and len(some) < len(self.config.space):
+            options["scales"] = np.asarray(options["scales"], dtype=np.float64)[some]
         if rule == AUTO or is_derived(rule, options):
-            return self._as_known(rows, members, means, covariances)
+            return self._as_known(rows, members, means, covariances, some, options)
         if self.groups is not None:
             options["max_correlation"] = self._between(rows, members)
         fused = fuse_last(rule, means, covariances, weights, influence=True, **options)
@@ -77,14 +79,18 @@ class Correlation:
         R[range(N), range(N)] = 1.0
         return R
 
-    def _as_known(self, rows: Rows, members: Ints, means: Floats, covariances: Floats) -> tuple[Fused, Ways]:
+    def _as_known(
+        self, rows: Rows, members: Ints, means: Floats, covariances: Floats, some: Ints, options: dict[str, Any]
+    ) -> tuple[Fused, Ways]:
         """By the cross-covariances where all of a target are known; else under the bounds, those derived and those
         declared; else by `ci`."""
         size, N = members.shape
         n = means.shape[1]
+        few = {name: value for name, value in options.items() if name not in ("max_correlation", "cross")}
         R, C, unknown = np.ones((N, N, size)), np.zeros((N, N, n, n, size)), np.ones(size)
         if self.followed is not None and N > 1:
             R, C, unknown = self.followed.of(members)
+            C = C[:, :, some][:, :, :, some]
         derived = (R < 1.0).any(axis=(0, 1))
         R = np.minimum(R, self._between(rows, members))
         bounded = (R < 1.0).any(axis=(0, 1))
@@ -92,17 +98,13 @@ class Correlation:
         exact = _part("bar-shalom-campo", means, covariances, known, cross_covariance=C)
         known &= np.isfinite(exact.covariance[0, 0]) & (exact.covariance[0, 0] > 0.0)
         bounded &= ~known
-        under = _part("bci", means, covariances, bounded, max_correlation=R, **self._few())
+        under = _part("bci", means, covariances, bounded, max_correlation=R, **few)
         neither = ~known & ~bounded
-        safe = _part("ci", means, covariances, neither, **self._few())
+        safe = _part("ci", means, covariances, neither, **few)
         columns = zip(_columns(exact), _columns(under), _columns(safe), strict=True)
         fused = Fused(*(np.where(known, a, np.where(bounded, b, c)) for a, b, c in columns))
         way = np.where(known, BY_CROSS, np.where(bounded, np.where(derived, BY_DERIVED, BY_DECLARED), BY_CI))
         return fused, way.astype(np.uint8)
-
-    def _few(self) -> dict[str, Any]:
-        """The options of the rule that have nothing to do with correlation."""
-        return {k: v for k, v in self.config.rule_options.items() if k not in ("max_correlation", "cross")}
 
 
 def _part(rule: str, means: Floats, covariances: Floats, some: Bools, **options: Any) -> Fused:

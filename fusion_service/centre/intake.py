@@ -22,6 +22,7 @@ from fusion_service.centre.clock import horizon
 from fusion_service.centre.declared import declared_by, loosened, motion_declared, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
+from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lineage import Lineages
@@ -330,7 +331,7 @@ class Intake:
             return "" if is_sound(message) else "bad-info"
         if last >= 0 and holds < last - round(self.config.lateness * 1e9):
             return "late"
-        if not set(self.config.space) <= set(message.space):
+        if self.config.kind == "intensity" and not set(self.config.space) <= set(message.space):
             return "space"
         if isinstance(message, LocalIntensity) is not (self.config.kind == "intensity"):
             return "intensity" if isinstance(message, LocalIntensity) else "tracks"
@@ -384,9 +385,10 @@ class Intake:
             try:
                 if self.frame is None:
                     raise FrameError(notes.unfit(name_frame(first.frame), self.config.space))
+                messages = [with_height(one, said.height, self.frame, self.config.space) for one in messages]
                 most, words = self.config.max_components, (self.said, self.lineages)
                 new = message_tracks(messages, sound, self.frame, said.height, most, *words)
-                new = loosened(new, first.space, said)
+                new = loosened(new, messages[0].space, said)
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))
             else:

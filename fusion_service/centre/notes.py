@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from fusion_service.config import CentreConfig
+from fusion_service.rules import RULES
 from schemas import Message
 
-__all__ = ["ahead", "frame_refused", "frame_waiting", "refusal", "stale", "unfit", "waiting"]
+__all__ = ["ahead", "frame_refused", "frame_waiting", "partial", "refusal", "stale", "unfit", "waiting"]
 
 
 def refusal(reason: str, message: Message, last: int, received: int, config: CentreConfig) -> str:
@@ -55,3 +56,14 @@ def frame_refused(why: str) -> str:
 def unfit(spoken: str, space: tuple[str, ...]) -> str:
     """What it speaks in cannot be the frame of the picture."""
     return f"{spoken} cannot be the frame of a picture in {' '.join(space)}"
+
+
+def partial(space: tuple[str, ...], config: CentreConfig) -> str:
+    """Its tracks lack components of the picture, and the rule is not in information form; else empty."""
+    missing = [name for name in config.space if name not in space]
+    if not missing or config.kind == "intensity" or config.rule not in RULES or RULES[config.rule].information:
+        return ""
+    return (
+        f"its tracks have no {' '.join(missing)}: {config.rule} fuses what all sources of a track have, "
+        f"and these follow from the sources that tell them"
+    )

@@ -18,8 +18,10 @@ import numpy as np
 from fusion_service.arrays import Bools, Ints
 from fusion_service.centre.increments import Increments
 from fusion_service.centre.intake import Intake
+from fusion_service.centre.partial import AXES, PLACED
 from fusion_service.centre.sources import Source
 from fusion_service.centre.stated_registration import shift_of
+from schemas import Motion
 
 __all__ = ["INNOVATIONS", "WATCHED", "Record", "Watch", "reason_of"]
 
@@ -137,6 +139,13 @@ def reason_of(intake: Intake, source: Source) -> str:
         return "covariance_floor"
     if shift_of(intake, source) is not None:
         return "registration"
-    if not set(source.space) <= set(intake.config.space):
+    if not set(source.space) <= set(intake.config.space) or _goes_unseen(source, intake.config.space, said.motion):
         return "space"
     return ""
+
+
+def _goes_unseen(source: Source, space: tuple[str, ...], motion: Motion) -> bool:
+    """Whether it tells places whose velocity it does not know: how these move is no tracker's prediction."""
+    there = source.space
+    unseen = any(place in there and speed in space and speed not in there for place, speed in AXES)
+    return unseen and motion.kind not in PLACED

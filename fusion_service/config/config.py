@@ -147,6 +147,9 @@ class CentreConfig:
         1e-3, number(1e-9, 0.2), "rate of wrong decisions about links, exchanges, merges and splits"
     )
     manoeuvre: float = _setting(20.0, number(0, 1e4), "acceleration that targets may show unannounced, m/s2 (1 sigma)")
+    unknown_speed: float = _setting(
+        100.0, number(0, 1e5), "speed that targets may have of which nobody tells the velocity, m/s (1 sigma)"
+    )
     confirm_hits: int = _setting(2, whole(1, 64), "reports with a new measurement that confirm a track ...")
     confirm_within: int = _setting(4, whole(1, 64), "... of so many that were due")
     min_sources: int = _setting(1, whole(1, 255), "sources that a track needs to be confirmed")
