@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from time import process_time
+
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -122,15 +124,32 @@ def test_the_table_is_bounded_forgets_what_is_not_used_and_never_tells_too_littl
     assert len(table) <= MOST_SETS
     assert len(table.names) <= MOST_NAMES
     masks = table.masks(np.array([code, kept, NOBODY], dtype=np.int32))
-    meet = overlapping(masks, np.array([[0, 1, 2]]))[0]
-    assert meet[0].all(), "what does not fit overlaps with all"
-    assert code == ANYONE or masks[0, 0] & np.uint64(1)
-    new = table.compacted([np.array([kept, -1], dtype=np.int32)])
+    meet = overlapping(masks, np.array([[0, 1]]))[0]
+    assert meet.all(), "what does not fit overlaps with all"
+    assert table.contain(np.array([code], dtype=np.int32), "never heard of").all()
+    new = table.compacted([np.array([kept, ANYONE, -1], dtype=np.int32)])
     assert new is not None
-    assert len(table) == 3
+    assert (len(table), len(table.names)) == (3, 3)
     assert new[-1] == -1
+    assert new[ANYONE] == ANYONE
     assert new[kept] == table.of(["b", "a"])
+    assert table.contain(new[[kept]], "a").all()
+    assert not table.contain(new[[kept]], "x1").any()
     assert table.compacted([np.array([kept], dtype=np.int32)]) is None
+
+
+def test_a_huge_lineage_costs_little() -> None:
+    rng = np.random.default_rng(6)
+    table, names = Lineages(), tuple(f"n{k}" for k in range(5000))
+    bits = rng.integers(0, 256, (20_000, 625)).astype(np.uint8)
+    begin = process_time()
+    for part in (bits[:2000], bits):
+        message = tracks("s", 1, np.zeros((len(part), 4)), lineage=names, track_lineage=part)
+        codes = table.of_message(message)
+        assert table.contain(codes, "n4999").all(), "more than is told apart: every track contains all"
+        assert table.masks(codes).shape[1] == len(part)
+    table.compacted([codes[:1]])
+    assert process_time() - begin < 10
 
 
 def test_bits_that_say_nothing_say_all_and_bits_beyond_the_names_mean_nothing() -> None:
