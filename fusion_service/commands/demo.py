@@ -14,7 +14,7 @@ HELP = "A whole mission: hub, service, clients and recorder as processes, then a
 EXAMPLE = """fusion-service demo
   fusion-service demo --rule hmd-ga --json result.json
   fusion-service demo --scenario autoferry:2 --data DIR --speed 10
-  fusion-service demo --scenario mrclam:6 --data DIR --speed 30
+  fusion-service demo --scenario mrclam:6 --data DIR
   fusion-service demo --rule bci --set rule_options.max_correlation=0.5 --set gate=0.99"""
 
 
@@ -33,7 +33,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre, above all others"
     )
     parser.add_argument(
-        "--speed", type=argument(positive), default=None, help="times faster than real time (default 10)"
+        "--speed", type=argument(positive), default=None, help="times faster than real time (default 10, mrclam 5)"
     )
     parser.add_argument("--seed", type=argument(whole), default=1, help="of the simulated sensors (default 1)")
     parser.add_argument(

@@ -94,7 +94,7 @@ def plan_mission(
     if kind == "mrclam":
         robots = (f"robot{n}{suffix}" for suffix in ("", "-self") for n in range(1, 6))
         return MissionPlan(
-            scenario, {name: [*command, name] for name in (*robots, "truth")}, MRCLAM, 756.0, 10.0, 1.0, 1.0, 3.0
+            scenario, {name: [*command, name] for name in (*robots, "truth")}, MRCLAM, 756.0, 5.0, 1.0, 1.0, 3.0
         )
     clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
     return MissionPlan(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)
