@@ -50,7 +50,8 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         predicted = predict_tracks(
             table, said.motion, source.space, config.space, age, intake.frame, config.unknown_speed
         )
-        predicted = _shifted(predicted, shift_of(intake, source))
+        if config.kind == "tracks":
+            predicted = _shifted(predicted, shift_of(intake, source))
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):

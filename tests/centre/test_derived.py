@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,14 +11,13 @@ import schemas
 from fusion_service.arrays import Floats
 from fusion_service.centre import FusionCentre
 from fusion_service.centre.correlation import Correlation
-from fusion_service.centre.derived import Derived, Followed, Successive, _largest
-from fusion_service.centre.rows import Rows
+from fusion_service.centre.derived import Derived, Followed, _largest
 from fusion_service.centre.shared_noise import SharedNoise
 from fusion_service.config import centre_config
 from fusion_service.rules import fuse
 from schemas import Motion
 from tests.centre.worlds import FRAME, START
-from tests.helpers.filters import SPACE, Filters, Heard, moved, steps
+from tests.helpers.filters import SPACE, Filters, moved, steps
 
 SEED = 12
 NAMES = ("s0", "s1", "s2")
@@ -99,7 +97,7 @@ def excess(filters: Filters, rule: str, now: Followed) -> Floats:
     for column in range(N * 4):  # the gains are those of unit errors
         means = np.zeros((N, 4, T))
         means[column // 4, column % 4] = 1.0
-        fused = known.fuse(rows, members, means, np.ascontiguousarray(P), None)
+        fused, _ = known.fuse(rows, members, means, np.ascontiguousarray(P), None, np.arange(4))
         gains[:, column], reported = fused.mean, fused.covariance
     K, S = gains.transpose(2, 0, 1), reported.transpose(2, 0, 1)
     W = np.linalg.inv(np.linalg.cholesky(S))
@@ -217,18 +215,6 @@ def test_the_largest_singular_value_is_never_below_the_true_one(n: int) -> None:
     assert (found <= true * n ** (1 / 128) * (1 + 1e-8)).all()
 
 
-class Told(FusionCentre):
-    """A centre that is told what versions its rows have gone through."""
-
-    heard: Heard | None = None
-
-    def _versions(self, rows: Rows) -> Successive | None:
-        assert self.heard is not None
-        at = np.lexsort((rows.tracks.id, rows.source))
-        np.testing.assert_array_equal(at, np.arange(len(at)))
-        return replace(self.heard, time=self.heard.time + START, before=self.heard.before + START)
-
-
 def messages(filters: Filters, seconds: int) -> list[schemas.Message]:
     T = filters.sigma.shape[1]
     means = np.stack([1000.0 * np.arange(T), np.zeros(T), np.zeros(T), np.zeros(T)], axis=1)
@@ -257,8 +243,8 @@ def test_a_centre_fuses_by_it_and_goes_on_after_a_restart(rule: str, options: di
     """What it publishes is what the truth makes of the tracks, and is the same in any order of arrival and from a
     checkpoint."""
     config = {"rule": rule, "rule_options": options, "space": SPACE, "frame": FRAME, "lateness": 1.0}
-    whole, turned = (Told(config) for _ in range(2))
-    restored: Told | None = None
+    whole, turned = (FusionCentre(config) for _ in range(2))
+    restored: FusionCentre | None = None
     filters = Filters(SIGMAS, **WORLDS["asynchronous"])
     for one in (whole, turned):
         for name in NAMES:
@@ -267,11 +253,10 @@ def test_a_centre_fuses_by_it_and_goes_on_after_a_restart(rule: str, options: di
                 position=(0.0, 0.0, 0.0),
             )  # fmt: skip
             one.handle(info, START)
-    for time, heard in steps(filters, 60):
+    for time, _ in steps(filters, 60):
         sent = messages(filters, time // 10**9)
         results = []
         for one in (whole, turned, *([restored] if restored else [])):
-            one.heard = heard
             for message in sent if one is whole else sent[::-1]:
                 one.handle(message, START + time)
             results.append(one.step(START + time).tracks)
@@ -279,7 +264,7 @@ def test_a_centre_fuses_by_it_and_goes_on_after_a_restart(rule: str, options: di
             for name in ("ids", "means", "covariances", "contributor_influence"):
                 np.testing.assert_array_equal(getattr(other, name), getattr(results[0], name))
         if time == 20 * 10**9:
-            restored = Told(config, turned.checkpoint())
+            restored = FusionCentre(config, turned.checkpoint())
     assert restored is not None
     published = results[0]
     true = filters.J

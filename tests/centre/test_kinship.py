@@ -15,10 +15,11 @@ from fusion_service.rules import fuse_last
 from tests.centre.worlds import tracks
 
 Floats = NDArray[np.float64]
+Ints = NDArray[np.intp]
 ATOMS = 6
 
 
-def naive(means: Floats, covariances: Floats, which: list[int]) -> Estimates:
+def naive(means: Floats, covariances: Floats, which: list[int], some: Ints) -> Estimates:
     fused = fuse_last("naive", means, covariances, None, influence=True)
     assert fused.influence is not None
     return Estimates(fused.mean, fused.covariance, fused.influence)
