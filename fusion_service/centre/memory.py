@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size
-from fusion_service.centre.correlation import declared_correlation, declared_motions, sound_rows
+from fusion_service.centre.correlation import AUTO, declared_correlation, declared_motions, sound_rows
 from fusion_service.centre.derived import Derived, Followed
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.increments import Increments, increments
@@ -27,7 +27,7 @@ from fusion_service.centre.rows import Rows
 from fusion_service.centre.shared_noise import SharedNoise
 from fusion_service.centre.tracklets import Filters, Operations, run
 from fusion_service.centre.versions import Versions, versions_of
-from fusion_service.centre.watch import INNOVATIONS, WATCHED, Watch
+from fusion_service.centre.watch import UNTRUE, WATCHED, Watch
 from schemas import Entry
 
 __all__ = ["Memory"]
@@ -90,12 +90,13 @@ class Memory:
     def _followed(
         self, rows: Rows, names: tuple[str, ...], versions: Versions, time: int, journal: Journal
     ) -> Followed | None:
-        """What successive covariances tell of the correlation of rows; not of those whose own innovations speak
-        against what they say."""
+        """What successive covariances tell of the correlation of rows; by rule auto not of those whose own innovations
+        speak against what they say."""
         if not self._config.by_derived:
             return None
-        trusted = np.array([self.watch.records[name].reason != INNOVATIONS for name in names], dtype=np.bool_)
-        sound = sound_rows(rows) & trusted[rows.source] & kinship.alone(self._intake, rows)
+        chosen = self._config.rule != AUTO
+        trusted = [chosen or self.watch.records[name].reason not in UNTRUE for name in names]
+        sound = sound_rows(rows) & np.array(trusted, dtype=np.bool_)[rows.source] & kinship.alone(self._intake, rows)
         noise = SharedNoise(declared_motions(self._intake), self._config.space)
         followed = self.derived.follow(rows, names, versions, noise, sound, time)
         if self.derived.beyond:

@@ -23,11 +23,13 @@ from fusion_service.centre.sources import Source
 from fusion_service.centre.stated_registration import shift_of
 from schemas import Motion
 
-__all__ = ["INNOVATIONS", "WATCHED", "Record", "Watch", "reason_of"]
+__all__ = ["INNOVATIONS", "UNTRUE", "WATCHED", "Record", "Watch", "reason_of"]
 
 INNOVATIONS = "innovations"
 WATCHED = ("", INNOVATIONS, "registration", "covariance_floor")
 """Reasons, of those whose increments are what the tracker has measured all the same."""
+UNTRUE = (INNOVATIONS, "feedback", "motion")
+"""Reasons for which nothing is to be concluded from successive covariances either."""
 REMEMBERED = 2000.0
 """Degrees of freedom that a sum holds about; older ones fade."""
 SIGMAS = 3.3

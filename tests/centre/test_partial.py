@@ -16,7 +16,7 @@ from fusion_service.geodesy import enu_to_geodetic, geodetic_to_ecef, geodetic_t
 from fusion_service.motion import predict
 from fusion_service.rules import RULES
 from schemas import UNKNOWN_SIGMA, Ecef, Enu, Height, Motion
-from tests.centre.worlds import FRAME, SECOND, SPACE, START, give, info, step, tracks
+from tests.centre.worlds import FRAME, SPACE, give, info, step, tracks
 from tests.helpers.random_missions import narrowed
 
 LONG = ("x", "y", "z", "vx", "vy", "vz")
@@ -271,9 +271,6 @@ def test_a_vague_component_is_one_that_is_not_told() -> None:
     np.testing.assert_allclose(pictures[0].covariances, pictures[1].covariances, rtol=1e-12)
 
 
-# ---- height
-
-
 def there(second: float) -> tuple[np.ndarray, float]:
     """The target's place in FRAME at a time, and its altitude."""
     now = STATE[:3] + second * STATE[3:]
@@ -399,4 +396,3 @@ def test_better_than_the_full_source_and_honest(seed: int) -> None:
     P = picture.covariances[order]
     nees = np.einsum("ti,tij,tj->t", errors, np.linalg.inv(P), errors).mean() / 4
     assert nees < 1.1
-    assert picture.time == START + 5 * SECOND

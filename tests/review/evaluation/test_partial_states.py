@@ -17,7 +17,7 @@ LONG = ("x", "y", "z", "vx", "vy", "vz")
 
 @pytest.mark.parametrize(("space", "height"), [(LONG, False), (LONG, True), (("x", "y", "vx", "vy"), False)])
 def test_a_picture_of_places_alone_is_scored(space: tuple[str, ...], height: bool) -> None:
-    """A camera's places with sigma 10 m of a target 3 km up: on the plane unless the height is known."""
+    """A camera's places with sigma 10 m of a target 3 km up: as they are, on the plane unless height is known."""
     rng = np.random.default_rng(1)
     centre = FusionCentre({"space": list(space), "frame": {"kind": "enu", "lat": FRAME.lat, "lon": FRAME.lon}})
     tells = ("x", "y", "z") if height else ("x", "y")
