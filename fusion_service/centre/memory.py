@@ -67,10 +67,7 @@ class Memory:
             return self._moving(rows, names, picture), influence
         at = np.where(rows.inside_mask(), now.find(rows.tracks.link), -1)
         capable = self._capable(rows, names)
-        filtered = np.zeros(len(now.id) + 1, dtype=np.bool_)
-        filtered[at[capable & (at >= 0)]] = True
-        filtered[-1] = False
-        filtered[:-1] &= before.time >= 0
+        filtered = np.append(self._filtered(now, before, at, capable), False)
         picture, influence = fuse_all(rows, now, time, known, journal, filtered[at])
         ruled = np.zeros(len(now.id) + 1, dtype=np.bool_)
         ruled[at[~filtered[at]]] = True
@@ -78,6 +75,15 @@ class Memory:
             rows, names, before, picture, influence, at, capable, filtered, ruled[:-1], step, time, versions, found
         )
         return self._moving(rows, names, picture), influence
+
+    def _filtered(self, now: Picture, before: Picture, at: Ints, capable: Bools) -> Bools:
+        """Which tracks (G,) go by a filter: that two capable rows feed, or one alone where there is a filter already.
+        A filter of one row would only do again what its tracker has done."""
+        fed, count = at >= 0, len(now.id)
+        able = np.bincount(at[fed & capable], minlength=count)
+        other = np.bincount(at[fed & ~capable], minlength=count)
+        held = np.isin(now.id, self.filters.id)
+        return np.asarray(((able > 1) | (held & (able > 0) & (other == 0))) & (before.time >= 0))
 
     def _moving(self, rows: Rows, names: tuple[str, ...], picture: Picture) -> Picture:
         """The picture, its tracks moving as the sources that feed them declare."""

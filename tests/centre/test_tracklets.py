@@ -178,7 +178,7 @@ def test_a_late_source_is_put_in_its_place() -> None:
     assert np.abs((picture.means[order] - in_time.means[at]) / sigma[at]).max() < 1e-3
     assert np.abs(np.diagonal(picture.covariances[order], axis1=1, axis2=2) / sigma[at] ** 2 - 1).max() < 1e-3
     assert ways(picture) == {"tracklet"}
-    assert late.result.status.sources["b"]["tracklets"] > 0.95
+    assert late.result.status.sources["b"]["tracklets"] > 0.9
 
 
 @pytest.mark.parametrize(
@@ -209,8 +209,7 @@ def test_a_source_that_says_nothing_of_its_motion_goes_by_the_rule() -> None:
         world.hear(*(world.look(name) for name in world.filters))
         picture = world.step(float(t))
     assert world.result.status.sources["b"]["no_tracklets"] == "motion"
-    assert ways(picture) == {"tracklet"}, "the track has one row that gives tracklets"
-    assert np.linalg.eigvalsh(picture.covariances[0] - world.filters["b"].P).max() < 1e-6, "no worse than either row"
+    assert ways(picture) == {"ci"}, "a filter of one row would only do again what its tracker has done"
 
 
 def test_a_tracker_that_is_too_sure_is_seen_and_left_out() -> None:

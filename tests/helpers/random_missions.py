@@ -63,7 +63,7 @@ def settings(rng: np.random.Generator) -> CentreConfig:
         "period": one(0.5, 1.0),
         "memory": one("restart", "recursive", "tracklet", "tracklet"),
         "memory_correlation": one(1.0, 0.5),
-        "rule": one("ci", "naive", "aa", "ici", "ei", "cu", "hmd-ga", "fast-ci"),
+        "rule": one("ci", "naive", "aa", "ici", "ei", "cu", "hmd-ga", "fast-ci", "auto", "auto", "bci"),
         "mixture_rule": one("moments", "gm-ga", "aa", "cu-modes"),
         "max_components": one(1, 3, 8),
         "publish": one("mixture", "mean", "mode"),
