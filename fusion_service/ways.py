@@ -62,7 +62,7 @@ def innovations(said: Mapping[str, Any]) -> str:
     text = f"innovations {ratio:.2f}, right within {low:.2f} to {high:.2f}"
     if ratio > high:
         return f"{text}: too large, its measurements are worse, or targets move more, than it says"
-    return text + (": too small, errors of its measurements go together, or it says too little" if ratio < low else "")
+    return text + (": too small, its tracker is not what it declares, or its errors go together" if ratio < low else "")
 
 
 def tracklet_health(said: Mapping[str, Any]) -> str:
