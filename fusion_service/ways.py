@@ -68,12 +68,12 @@ def innovations(said: Mapping[str, Any]) -> str:
 def tracklet_health(said: Mapping[str, Any]) -> str:
     """What a source's entry in the status says of its tracklets, in a line; "" where it says nothing."""
     share, why = _number(said.get("tracklets")), _text(said.get("no_tracklets"))
-    parts = [] if share is None else [f"{share:.0%} of its new versions taken as tracklets"]
+    parts = [] if share is None else [f"{100 * share:.0f} % of its new versions taken as tracklets"]
     if why:
         parts = [f"no tracklets: {reason_words(why)}"]
     ratio, high = _number(said.get("innovation")), _number(said.get("innovation_high"))
     if share and not why and ratio is not None and high is not None and ratio > high:
-        parts.append(f"each counts {1 / ratio:.0%}")
+        parts.append(f"each counts {100 / ratio:.0f} %")
     return "; ".join(filter(None, [*parts, innovations(said)]))
 
 
