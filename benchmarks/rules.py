@@ -169,7 +169,7 @@ def measure(
         ours: list[float] = []
         a: list[float] = []
         b: list[float] = []
-        given = {key: own(key, P) if value == "own" else value for key, value in options.items()}
+        given: dict[str, Any] = {key: own(key, P) if value == "own" else value for key, value in options.items()}
         for _ in range(rounds):
             ours.append(clock(lambda: fuse(rule, x, P, **given)))  # noqa: B023
             a.append(clock(lambda: stacked(x, P)))
