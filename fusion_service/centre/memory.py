@@ -56,7 +56,8 @@ class Memory:
             picture, influence = fuse_all(rows, now, time, known, journal)
             return self._moving(rows, names, picture), influence
         for event in self.watch.begin(self._intake, names):
-            journal.event(event)
+            if self._config.by_tracklets:
+                journal.event(event)
         versions = versions_of(self._intake, rows)
         found = increments(versions)
         followed = self._followed(rows, names, versions, time, journal)

@@ -4,9 +4,28 @@ from __future__ import annotations
 
 from fusion_service.config import CentreConfig
 from fusion_service.rules import RULES
+from fusion_service.ways import reason_words
 from schemas import Message
 
-__all__ = ["ahead", "frame_refused", "frame_waiting", "partial", "refusal", "stale", "unfit", "waiting"]
+__all__ = [
+    "ahead",
+    "frame_refused",
+    "frame_waiting",
+    "no_tracklets",
+    "partial",
+    "refusal",
+    "stale",
+    "unfit",
+    "waiting",
+]
+
+MENDS = {
+    "motion": "let it declare its motion, or set motion for it under [centre.sources]",
+    "space": "set space under [centre] to hold its components, and let it send velocities or declare ou or still",
+    "innovations": "let its covariances and the motion it declares be those of its tracker and its targets",
+    "increments": "a tracker of several models, or one whose covariances are edited, gives none",
+}
+"""What to do, or what is behind it."""
 
 
 def refusal(reason: str, message: Message, last: int, received: int, config: CentreConfig) -> str:
@@ -67,3 +86,8 @@ def partial(space: tuple[str, ...], config: CentreConfig) -> str:
         f"its tracks have no {' '.join(missing)}: {config.rule} fuses what all sources of a track have, "
         f"and these follow from the sources that tell them"
     )
+
+
+def no_tracklets(why: str) -> str:
+    """Its tracks go by the rule, not as tracklets, for the reason `why`."""
+    return f"no tracklets of it: {reason_words(why)}" + (f": {MENDS[why]}" if why in MENDS else "")

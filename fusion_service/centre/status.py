@@ -38,13 +38,19 @@ def step_status(
         refused=refused,
         dropped=dict(sorted(journal.dropped.items())),
         sources={
-            name: _health(source, intake, journal, log.time) | dict((more or {}).get(name, {}))
+            name: _told(_health(source, intake, journal, log.time) | dict((more or {}).get(name, {})))
             for name, source in sorted(intake.sources.items())
         },
         tracks=tracks,
         step_time={},
         notes=told,
     )
+
+
+def _told(entry: dict[str, Any]) -> dict[str, Any]:
+    """An entry whose note says also why there are no tracklets, where there is nothing that matters more."""
+    why = entry.get("no_tracklets", "")
+    return entry | {"note": entry["note"] or notes.no_tracklets(why)} if why else entry
 
 
 def _health(source: Source, intake: Intake, journal: Journal, time: int) -> dict[str, Any]:

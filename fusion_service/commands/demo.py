@@ -13,6 +13,7 @@ __all__ = ["EXAMPLE", "HELP", "add", "run"]
 HELP = "A whole mission: hub, service, clients and recorder as processes, then a table, a map and a recording."
 EXAMPLE = """fusion-service demo
   fusion-service demo --rule hmd-ga --json result.json
+  fusion-service demo --memory tracklet
   fusion-service demo --scenario autoferry:2 --data DIR --speed 10
   fusion-service demo --scenario mrclam:6 --data DIR
   fusion-service demo --rule bci --set rule_options.max_correlation=0.5 --set gate=0.99"""
@@ -26,9 +27,16 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of the recordings, or that holds autoferry/, mrclam/ (default: $FUSION_DATA)",
     )
-    parser.add_argument("--rule", default="ci", help="fusion rule (default ci; `fusion-service rules` lists them)")
+    parser.add_argument(
+        "--rule", default="ci", help="fusion rule, or auto (default ci; `fusion-service rules` lists them)"
+    )
     parser.add_argument("--criterion", help="of the rule's weights: det or trace")
-    parser.add_argument("--memory", default="restart", choices=("restart", "recursive"), help="default restart")
+    parser.add_argument(
+        "--memory",
+        default="restart",
+        choices=("restart", "recursive", "tracklet"),
+        help="local tracks only (default), the last result too, or what successive versions of them have added",
+    )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre, above all others"
     )

@@ -96,7 +96,7 @@ def _global(message: GlobalTracks, track: int) -> GlobalTracks:
 
 COLUMNS = ("source", "epoch", "id", "influence")
 TEXTS = ("identity", "kind", "callsign")
-OPTIONAL = ("kind_p", "identity_p", "track_origin", "marks", "number", "track_lineage")
+OPTIONAL = ("kind_p", "identity_p", "track_origin", "marks", "number", "track_lineage", "track_rule")
 
 
 def _said(message: GlobalTracks | LocalTracks, rows: NDArray[np.bool_]) -> dict[str, Any]:
