@@ -62,18 +62,18 @@ def innovations(said: Mapping[str, Any]) -> str:
     text = f"innovations {ratio:.2f}, right within {low:.2f} to {high:.2f}"
     if ratio > high:
         return f"{text}: too large, its measurements are worse, or targets move more, than it says"
-    return text + (": too small, errors of its measurements go together, or it says too little" if ratio < low else "")
+    return text + (": too small, its tracker is not what it declares, or its errors go together" if ratio < low else "")
 
 
 def tracklet_health(said: Mapping[str, Any]) -> str:
     """What a source's entry in the status says of its tracklets, in a line; "" where it says nothing."""
     share, why = _number(said.get("tracklets")), _text(said.get("no_tracklets"))
-    parts = [] if share is None else [f"{share:.0%} of its new versions taken as tracklets"]
+    parts = [] if share is None else [f"{100 * share:.0f} % of its new versions taken as tracklets"]
     if why:
         parts = [f"no tracklets: {reason_words(why)}"]
     ratio, high = _number(said.get("innovation")), _number(said.get("innovation_high"))
     if share and not why and ratio is not None and high is not None and ratio > high:
-        parts.append(f"each counts {1 / ratio:.0%}")
+        parts.append(f"each counts {100 / ratio:.0f} %")
     return "; ".join(filter(None, [*parts, innovations(said)]))
 
 

@@ -260,3 +260,21 @@ def test_a_common_error_never_averages_out() -> None:
         picture = world.step(float(t))
     expected = world.filters["a"].P + np.diag([900.0, 400.0, 0.0, 0.0])
     assert np.abs(picture.covariances - expected).max() < 1e-6 * 900
+
+
+def test_a_note_says_in_words_why_there_are_no_tracklets_and_only_where_they_are_asked_for() -> None:
+    derived: dict[str, Any] = {"memory": "restart", "rule": "bar-shalom-campo", "rule_options": {"cross": "derived"}}
+    for asked in (True, False):
+        world = World({"a": 8.0, "b": 13.0}, seed=4, **({} if asked else derived))
+        world.say("a")
+        for t in range(1, 5):
+            world.move(float(t))
+            world.hear(*(world.look(name) for name in world.filters))
+            world.step(float(t))
+            told = [event for event in world.result.log.events if event["kind"] == "tracklets"]
+            assert len(told) == (asked and t == 1)
+        sources = world.result.status.sources
+        assert sources["a"]["note"] == ""
+        assert sources["b"]["note"].startswith("no tracklets of it: nobody declares") == asked
+        assert ("tracklets" in sources["a"]) == asked
+        assert sources["a"]["innovation"] > 0

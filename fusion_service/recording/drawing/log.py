@@ -139,8 +139,10 @@ class EventLog:
             self._fused_by(message, self._focus, stamp)
 
     def _fused_by(self, message: GlobalTracks, track: int, stamp: Stamp) -> None:
-        """A line when `track` is fused in another way than before."""
+        """A line when `track` is fused in another way than before, once not all are by the rule."""
         names, which = fused_by(message)
+        if message.rules is None and message.source not in self._ways:
+            return
         for row in np.flatnonzero(message.ids == np.uint64(track)).tolist():
             way = names[which[row]]
             if self._ways.get(message.source) != way:
