@@ -7,8 +7,8 @@ best of several rounds of each is compared, since a shared machine drifts by mor
   (b) a loop over fusions that finds the weights with `scipy.optimize` (some of them, scaled up),
   (c) where `stonesoup` can be imported: a loop of its `ChernoffUpdater`, which has fixed weights.
 
-"own": a bound, or a cross-covariance, of each fusion's own. `/(a)` is time over (a)'s: smaller is better. `x(b)`, `x(c)`: how many times faster than these. Goals stand at
-the end of a line.
+"own": a bound, or a cross-covariance, of each fusion's own. `/(a)` is time over (a)'s: smaller is better. `x(b)`,
+`x(c)`: how many times faster than these. Goals stand at the end of a line.
 """
 
 import os
@@ -169,7 +169,7 @@ def measure(
         ours: list[float] = []
         a: list[float] = []
         b: list[float] = []
-        given = {key: own(key, P) if value == "own" else value for key, value in options.items()}
+        given: dict[str, Any] = {key: own(key, P) if value == "own" else value for key, value in options.items()}
         for _ in range(rounds):
             ours.append(clock(lambda: fuse(rule, x, P, **given)))  # noqa: B023
             a.append(clock(lambda: stacked(x, P)))

@@ -19,7 +19,7 @@ from studies.pictures import colour, ellipse
 from studies.statistics import Estimate, jackknife, mean
 from studies.study import Floats, Row
 
-__all__ = ["GROUPS", "Consistency", "consistency", "draw", "excess", "moments", "rows"]
+__all__ = ["GROUPS", "Chance", "Consistency", "by_chance", "consistency", "draw", "excess", "moments", "rows"]
 
 GROUPS = 50
 
@@ -56,6 +56,39 @@ def consistency(blocks: Floats) -> Consistency:
     if reported.stderr < 1e-9 * reported.value:
         reported = Estimate(reported.value, 0.0)
     return Consistency(reported, true, jackknife(excess, blocks, blocks.shape[-1]), P, mse)
+
+
+class Chance(NamedTuple):
+    """What an honest filter shows: its `excess` (times,) in so many repetitions; worth: how many independent errors the
+    steps of one run are worth, as far as mean squares go."""
+
+    excess: Floats
+    worth: float
+
+
+def by_chance(A: Floats, P: Floats, steps: int, runs: int, rng: np.random.Generator, times: int = 100) -> Chance:
+    """The excess over `runs` runs of `steps` steps of errors e' = A e + w that have the covariance P all along.
+
+    Mean squares of W e, P^-1 = W' W, whose correlation over k steps is W A^k W^-1, scatter as those of
+    steps / (1 + 2 sum_k (1 - k / steps) |W A^k W^-1|^2 / n) independent ones.
+    """
+    n = len(P)
+    L = np.linalg.cholesky(P)
+    values, V = np.linalg.eigh(P - A @ P @ A.T)
+    noise = V * np.sqrt(np.maximum(values, 0.0))
+    found = []
+    for _ in range(times):
+        e = L @ rng.standard_normal((n, runs))
+        square = np.zeros((n, n))
+        for _ in range(steps):
+            e = A @ e + noise @ rng.standard_normal((n, runs))
+            square += e @ e.T / (runs * steps)
+        found.append(float(correlation.excess(square, P)))
+    between, power, lost = np.linalg.solve(L, A @ L), np.eye(n), 0.0
+    for k in range(1, steps):
+        power = power @ between
+        lost += 2.0 * (1.0 - k / steps) * float((power**2).sum()) / n
+    return Chance(np.array(found), steps / (1.0 + lost))
 
 
 def rows(name: str, one: Consistency, where: str = "") -> list[Row]:

@@ -74,7 +74,7 @@ def fuse_all(
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
                 _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound, unknown)
         mean[:, at], covariance[:, :, at], state_time[at], way[at] = one, spread, time, by
-        lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory != "restart")
+        lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory == "recursive")
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]

@@ -28,14 +28,14 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="folder of the recordings, or that holds autoferry/, mrclam/ (default: $FUSION_DATA)",
     )
     parser.add_argument(
-        "--rule", default="ci", help="fusion rule, or auto (default ci; `fusion-service rules` lists them)"
+        "--rule", default="auto", help="fusion rule (default auto; `fusion-service rules` lists them)"
     )
     parser.add_argument("--criterion", help="of the rule's weights: det or trace")
     parser.add_argument(
         "--memory",
-        default="restart",
-        choices=("restart", "recursive", "tracklet"),
-        help="local tracks only (default), the last result too, or what successive versions of them have added",
+        default="auto",
+        choices=("auto", "restart", "recursive", "tracklet"),
+        help="what is fused beside the newest local tracks (default auto: tracklets with rule auto, else nothing)",
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre, above all others"

@@ -117,7 +117,7 @@ class CentreConfig:
     delay: float = _setting(0.5, DURATION, "wall clock: how far behind now a step is")
     lateness: float = _setting(5.0, DURATION, "how late a message may be, seconds")
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
-    rule: str = _setting("ci", read_rule, "fusion rule (fusion-service rules lists them)")
+    rule: str = _setting("auto", read_rule, "fusion rule (fusion-service rules lists them)")
     rule_options: dict[str, Any] = _setting({}, rule_options, "options of the rule, e.g. {criterion = 'trace'}")
     mixture_rule: str = _setting("moments", read_mixture_rule, "rule for mixtures; moments: as Gaussians, by the rule")
     mixture_options: dict[str, Any] = _setting({}, table, "options of the mixture rule")
@@ -130,9 +130,10 @@ class CentreConfig:
         None, maybe(read_coverage), "only tracks in it go out; about the origin of the picture's frame; left out: all"
     )
     memory: str = _setting(
-        "restart",
-        choice("restart", "recursive", "tracklet"),
-        "fuse local tracks only, the last result too, or what successive versions of them have added",
+        "auto",
+        choice("auto", "restart", "recursive", "tracklet"),
+        "fuse local tracks only, the last result too, or what their successive versions add; auto: tracklet with rule "
+        "auto, else restart",
     )
     memory_correlation: float = _setting(
         1.0, number(0, 1), "bound on the correlation of the last result and new tracks"
@@ -193,12 +194,12 @@ class CentreConfig:
     @property
     def follows(self) -> bool:
         """Whether successive versions of local tracks are used, not only the newest."""
-        return self.by_tracklets or self.by_derived
+        return self.kind == "tracks" and (self.by_tracklets or self.by_derived)
 
     @property
     def by_tracklets(self) -> bool:
         """Whether filters of the targets' own take tracklets, where they are sound."""
-        return self.memory == "tracklet" or self.rule == "auto"
+        return self.memory == "tracklet" or (self.memory == "auto" and self.rule == "auto")
 
     @property
     def by_derived(self) -> bool:

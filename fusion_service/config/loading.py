@@ -135,8 +135,6 @@ def _contradictions(config: CentreConfig) -> Iterator[tuple[str, str]]:
     """Settings that are good alone and bad together: which one to change, and why."""
     if isinstance(config.frame, Ecef) and "z" not in config.space:
         yield "frame", "an ECEF picture needs x, y and z in the space"
-    if config.rule == "auto" and config.memory == "recursive":
-        yield "memory", "is recursive, which rule auto does not take: leave it out, or choose another rule"
     hits, within = config.confirm_hits, config.confirm_within
     if hits > within:
         yield "confirm_hits", f"is {hits}, more than confirm_within, {within}: nothing would be confirmed"

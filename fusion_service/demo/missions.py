@@ -17,7 +17,6 @@ JITTER = 1.5
 THREE_RADARS = """\
 period = 10.0
 frame = {kind = "enu", lat = 59.7138694, lon = -55.2676093}   # collocated with radar 1 (Sharma 6.4)
-motion = {kind = "cv", q = 10.0}
 coast = 25.0
 """
 """Settings of the centre for the simulated radars, as TOML."""
@@ -25,7 +24,6 @@ coast = 25.0
 AUTOFERRY = """\
 period = 1.0
 frame = {kind = "enu", lat = 63.4389029083, lon = 10.39908278, alt = 39.923}   # Piren
-motion = {kind = "cv", q = 0.1}
 coast = 3.0
 """
 """Settings of the centre for the recorded lidar and radar, as TOML."""
