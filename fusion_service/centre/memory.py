@@ -127,7 +127,7 @@ class Memory:
         base = self.filters.bases(before)
         settled = filtered[at] & (tracks.since < step)
         row = versions.row
-        good = found.sound & (capable & settled)[row] & (versions.time >= base.time[at[row]])
+        good = found.sound & (capable & settled)[row] & (versions.time >= np.append(base.time, 0)[at[row]])
         spoiled = np.zeros(len(at), dtype=np.bool_)
         spoiled[row[~good]] = True
         good &= ~spoiled[row]
