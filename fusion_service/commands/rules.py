@@ -25,4 +25,5 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         print(f"{rule.name:<18}{'N-way   ' if rule.n_way else 'pairwise'}  {rule.promise}")
         print(f"{'':<18}options: {options}; source: {rule.source}")
     print(f"{'auto':<18}N-way     {AUTO_PROMISE}")
-    print(f"{'':<18}options: criterion='det', max_correlation=bounds between groups; in a centre only: docs/rules.md")
+    options = "criterion='det', scales=None, max_correlation=bounds between groups"
+    print(f"{'':<18}options: {options}; source: the default of a centre, docs/rules.md")

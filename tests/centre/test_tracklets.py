@@ -59,7 +59,9 @@ class World:
         self.filters = {name: Kalman(sigma) for name, sigma in sigmas.items()}
         self.seq = dict.fromkeys(sigmas, 0)
         self.t = 0.0
-        self.centre = FusionCentre({"memory": "tracklet", "coast": 1e3, "stale_periods": 1e3, "frame": FRAME, **config})
+        self.centre = FusionCentre(
+            {"rule": "ci", "memory": "tracklet", "coast": 1e3, "stale_periods": 1e3, "frame": FRAME, **config}
+        )
 
     def say(self, name: str, **said: Any) -> None:
         fields = {"position": (0.0, 0.0, 0.0), "period": 1.0, "motion": schemas.Motion("cv", Q1), **said}

@@ -92,14 +92,14 @@ def test_auto_is_among_the_rules(capsys: pytest.CaptureFixture[str]) -> None:
 @pytest.mark.parametrize(
     ("asked", "words"),
     [
-        (["--set", "rule_options.delta=0.5"], "auto has no option 'delta' (known: criterion, max_correlation)"),
+        (["--set", "rule_options.delta=0.5"], "auto has no option 'delta' (known: criterion, max_correlation, scales)"),
         (
             ["--set", "rule_options.max_correlation=0.5"],
             "auto takes max_correlation as a table of bounds between groups",
         ),
         (["--set", "rule_options.max_correlation={within = 2}"], "max_correlation.within is 2, must be a number from"),
         (["--criterion", "size"], "auto cannot fuse 1 source here: criterion 'size': one of det, trace"),
-        (["--memory", "recursive"], "memory: is recursive, which rule auto does not take"),
+        (["--set", "rule_options.scales=[1, 2]"], "auto cannot fuse 1 source here: "),
     ],
 )
 def test_what_auto_does_not_take_is_told_in_one_line(
@@ -115,7 +115,7 @@ def test_what_auto_does_not_take_is_told_in_one_line(
 def test_the_demo_and_a_replay_take_tracklets_and_auto() -> None:
     parser = argparse.ArgumentParser()
     COMMANDS["demo"].add(parser)
-    for memory in ("restart", "recursive", "tracklet"):
+    for memory in ("auto", "restart", "recursive", "tracklet"):
         assert parser.parse_args(["--memory", memory, "--rule", "auto"]).memory == memory
     for one in variants_of(["auto", "ci"], ["memory=tracklet"], ()):
         assert one.config({}).by_tracklets

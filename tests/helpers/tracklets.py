@@ -23,7 +23,7 @@ def fly(seconds: int = 24, *, fed: int = 24, alone: int = 24, targets: int = 3, 
     """Sources r1, r2 and r3, cv with q = 1, a scan a second. From second `fed` on r3 says that it is fed with fused
     tracks; after second `alone` only r3 sends. The status of each step is in the log too."""
     print(f"seed {seed}")
-    flight = Flight({"memory": "tracklet", "coast": 60.0, **config})
+    flight = Flight({"rule": "ci", "memory": "tracklet", "coast": 60.0, **config})
     rng = np.random.default_rng(seed)
     truth = np.hstack([9e3 * np.arange(targets)[:, None] * [1.0, 0.5], rng.normal(0, 10, (targets, 2))])
     names = ("r1", "r2", "r3")

@@ -82,7 +82,7 @@ def test_a_replay_makes_the_ways_again(mission: tuple[Path, Flight]) -> None:
 
 
 def test_a_mission_by_one_rule_says_nothing_of_ways(tmp_path: Path) -> None:
-    flight = Flight({})
+    flight = Flight({"rule": "ci"})
     places(flight, range(1, 6), lambda name, second: {1: (0.0, 0.0)})
     path = flight.record(tmp_path / "plain.rrd")
     assert "fused by" not in explanation(read_mission(path, track="1"))

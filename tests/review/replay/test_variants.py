@@ -58,11 +58,11 @@ def test_settings_that_no_log_can_hold_are_left_out() -> None:
 def test_several_rules_stand_side_by_side_in_one_recording(flight: Flight, mission: Path, tmp_path: Path) -> None:
     lines: list[str] = []
     out = tmp_path / "rules.rrd"
-    rules = ["ci", "hmd-ga:criterion=trace", "bci:max_correlation=0.5", "ci:criterion=trace"]
+    rules = ["ci", "hmd-ga:criterion=trace", "bci:max_correlation=0.5", "auto:criterion=trace"]
     replay = run_replay(mission, rules=rules, out=out, say=lines.append)
     names = [player.variant.name for player in replay.players]
-    assert names == ["ci", "hmd-ga-trace", "bci-0.5", "ci-trace"]
-    assert "ci, hmd-ga-trace, bci-0.5, ci-trace by their logs" in lines[0]
+    assert names == ["ci", "hmd-ga-trace", "bci-0.5", "auto-trace"]
+    assert "ci, hmd-ga-trace, bci-0.5, auto-trace by their logs" in lines[0]
     assert [line.split()[0] for line in lines[1:5]] == names
     kept = [raw[1:] for raw in raws(out) if not any(f"/{name}/" in raw.key for name in names)]
     assert kept == [raw[1:] for raw in raws(mission)]
@@ -71,7 +71,7 @@ def test_several_rules_stand_side_by_side_in_one_recording(flight: Flight, missi
         assert [picture.step for picture in made] == list(range(1, 15))
         assert {(p.origin, p.source, (p.lineage or ())[-1]) for p in made} == {("replay", name, name)}
         assert f"/picture/global/{name}" in entities(out)
-    same = [(a, b) for a, b in zip(pictures(out, "ci-trace"), (one.tracks for one in flight.steps), strict=True)]
+    same = [(a, b) for a, b in zip(pictures(out, "auto-trace"), (one.tracks for one in flight.steps), strict=True)]
     assert all(np.array_equal(a.means, b.means) and np.array_equal(a.ids, b.ids) for a, b in same)
     assert not np.array_equal(pictures(out, "hmd-ga-trace")[5].means, pictures(out, "ci")[5].means)
 
