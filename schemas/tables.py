@@ -142,7 +142,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _column("contributor_epoch", "<u8"),
         _column("contributor_id", "<u8"),
         _column("contributor_influence", "<f8"),
-        _plain("rules", _NAMES, list, optional=True),
+        _plain("rules", values.list_of(values.text), list, optional=True),
         _column("track_rule", "u1", optional=True),
         _plain("ended", _ENDED, values.pack_rows),
         _plain("split_from", _PAIRS, values.pack_rows),
