@@ -32,7 +32,7 @@ from fusion_service.rules import MIXTURE_RULES, RULES, Fused, fuse_last
 from fusion_service.rules.mixtures import fuse_mixtures_last
 from schemas import Entry
 
-__all__ = ["fuse_all"]
+__all__ = ["fuse_all", "with_parts"]
 
 
 MOST_PRODUCTS = 4096
@@ -79,7 +79,7 @@ def fuse_all(
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
     picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
-    return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
+    return with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
 def _gaussian(
@@ -215,7 +215,7 @@ def _remember(
     gains[:, kept] *= shares[0][good]
 
 
-def _with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]]) -> Picture:
+def with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]]) -> Picture:
     """The picture with the components of the tracks just fused; without any where all are Gaussian."""
     most = max([len(picture.log_weight), *(len(parts.log_weights) for _, parts in mixed)])
     if not most:

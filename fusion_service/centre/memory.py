@@ -17,7 +17,7 @@ from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size
 from fusion_service.centre.correlation import AUTO, declared_correlation, declared_motions, sound_rows
 from fusion_service.centre.derived import Derived, Followed
-from fusion_service.centre.fusing import fuse_all
+from fusion_service.centre.fusing import fuse_all, with_parts
 from fusion_service.centre.increments import Increments, increments
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
@@ -42,9 +42,14 @@ class Memory:
         self._intake = intake
         self._config = intake.config
         self.motions = Motions(intake)
-        self.filters = Filters.none(len(intake.config.space))
         self.watch = Watch()
-        self.derived = Derived(len(intake.config.space))
+        self._begin()
+
+    def _begin(self) -> None:
+        """Nothing that is in the picture's frame is known."""
+        self._frame = self._intake.frame
+        self.filters = Filters.none(len(self._config.space))
+        self.derived = Derived(len(self._config.space))
 
     def fuse(
         self, rows: Rows, names: tuple[str, ...], before: Picture, now: Picture, step: int, time: int, journal: Journal
@@ -55,6 +60,8 @@ class Memory:
             known = declared_correlation(self._intake, self._config)
             picture, influence = fuse_all(rows, now, time, known, journal)
             return self._moving(rows, names, picture), influence
+        if self._frame != self._intake.frame:
+            self._begin()
         for event in self.watch.begin(self._intake, names):
             if self._config.by_tracklets:
                 journal.event(event)
@@ -153,7 +160,8 @@ class Memory:
             there = picture.find(ids)
             lineage[there] = kinship.inherited(rows, fed[groups], lineage[there], memory=True)
         way = np.where(filtered[:-1], BY_TRACKLETS, picture.way).astype(np.uint8)
-        return replace(picture, mean=mean, covariance=covariance, time=when, lineage=lineage, way=way)
+        picture = replace(picture, mean=mean, covariance=covariance, time=when, lineage=lineage, way=way)
+        return with_parts(picture, some, [])
 
     def _note(self, rows: Rows, names: tuple[str, ...], row: Ints, found: Increments, taken: Bools) -> None:
         """Let the watch see the versions that count: of sources that declare what it takes, and Gaussian."""
@@ -211,20 +219,23 @@ class Memory:
         self.derived = Derived(len(self._config.space))
 
     def packed(self) -> dict[str, Any]:
-        """As plain values. What is in the picture's frame says which."""
+        """As plain values. What is in the picture's frame and space says which."""
         packed = {
-            "frame": repr(self._intake.frame), "motions": self.motions.packed(), "watch": self.watch.packed(),
-            "filters": self.filters.packed(),
+            "frame": repr(self._intake.frame), "space": list(self._config.space), "motions": self.motions.packed(),
+            "watch": self.watch.packed(), "filters": self.filters.packed(),
         }  # fmt: skip
         return packed | ({"derived": self.derived.packed()} if len(self.derived) else {})
 
     def restore(self, packed: dict[str, Any]) -> None:
         """From what `packed` gave; without what is in another frame or space."""
         self.motions.restore(packed["motions"])
-        self.watch.restore(packed["watch"])
-        if packed["frame"] != repr(self._intake.frame):
+        self._frame = self._intake.frame
+        if self._config.follows:
+            self.watch.restore(packed["watch"])
+        if packed["frame"] != repr(self._intake.frame) or packed.get("space") != list(self._config.space):
             return
-        self.filters = Filters.unpacked(packed["filters"], len(self._config.space))
+        if self._config.by_tracklets:
+            self.filters = Filters.unpacked(packed["filters"], len(self._config.space))
         if "derived" in packed and self._config.by_derived:
             self.derived.restore(packed["derived"])
 

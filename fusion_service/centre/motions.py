@@ -99,13 +99,13 @@ class Motions:
 
     def motion(self, code: int) -> Motion:
         """The motion of a code."""
-        return self.known[code] if code >= 0 else self._config.motion or USUAL
+        return self._config.motion or (self.known[code] if code >= 0 else USUAL)
 
     def follow(self, picture: Picture, at: Ints, declared: Iterable[Motion | None], source: Ints) -> Codes:
         """The codes (G,) after a step: tracks that rows feed move as these declare; at (R,) rows of the picture that
         rows of `source` (R,), index into `declared`, feed."""
         if self._config.motion is not None:
-            return picture.motion
+            return np.full_like(picture.motion, -1)
         codes = np.array([-1 if motion is None else self.code(motion) for motion in declared], dtype=np.int32)
         order = sorted(range(len(self.known)), key=self._noise.__getitem__)
         rank = np.full(len(self.known) + 1, -1)

@@ -68,13 +68,14 @@ class Unknown:
 
     def told(self, covariance: Floats) -> Floats:
         """Covariances (n, n, ...) as they are published: padding that is just large enough to be known as such, so that
-        readers lose no more digits by it than they must."""
+        readers lose no more digits by it than they must. What has become unknown, by noise, is correlated with nothing
+        then: less variance would not bear it."""
         known = self.known(covariance)
         if known.all():
             return covariance
-        out, diagonal = covariance.copy(), range(len(covariance))
+        out, diagonal = np.where(known[:, None] & known[None], covariance, 0.0), range(len(covariance))
         out[diagonal, diagonal] = np.where(
-            known, out[diagonal, diagonal], self.limit.reshape(-1, *(1,) * (known.ndim - 1))
+            known, covariance[diagonal, diagonal], self.limit.reshape(-1, *(1,) * (known.ndim - 1))
         )
         return out
 

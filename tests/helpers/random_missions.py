@@ -88,6 +88,8 @@ def settings(rng: np.random.Generator) -> CentreConfig:
             "d": {"ignore": one(False, False, True), "inflation": one(1.0, 4.0)},
         },
     }
+    if table["rule"] == "auto" and table["memory"] == "recursive":
+        table["memory"] = "restart"
     return centre_config(_without_none(table))
 
 
