@@ -7,8 +7,8 @@ best of several rounds of each is compared, since a shared machine drifts by mor
   (b) a loop over fusions that finds the weights with `scipy.optimize` (some of them, scaled up),
   (c) where `stonesoup` can be imported: a loop of its `ChernoffUpdater`, which has fixed weights.
 
-`/(a)` is time over (a)'s: smaller is better. `x(b)`, `x(c)`: how many times faster than these. Goals stand at
-the end of a line.
+"own": a bound, or a cross-covariance, of each fusion's own. `/(a)` is time over (a)'s: smaller is better. `x(b)`,
+`x(c)`: how many times faster than these. Goals stand at the end of a line.
 """
 
 import os
@@ -35,6 +35,8 @@ CASES: tuple[Case, ...] = (
     ("ci", {"criterion": "trace"}),
     ("bci", {"criterion": "det", "max_correlation": 0.5}),
     ("bci", {"criterion": "trace", "max_correlation": 0.5}),
+    ("bci", {"max_correlation": "own"}),
+    ("bar-shalom-campo", {"cross_covariance": "own"}),
     ("hmd-ga", {"criterion": "det"}),
     ("hmd-ga", {"criterion": "trace"}),
     ("ici", {"criterion": "det"}),
@@ -61,6 +63,17 @@ def estimates(rng: np.random.Generator, B: int, N: int, n: int) -> tuple[Floats,
     q, _ = np.linalg.qr(rng.normal(size=(B, N, n, n)))
     P = (q * 10.0 ** rng.uniform(-1, 1, size=(B, N, 1, n))) @ q.swapaxes(-1, -2)
     return rng.normal(size=(B, N, n)), 0.5 * (P + P.swapaxes(-1, -2))
+
+
+def own(name: str, P: Floats) -> Floats:
+    """The option `name` with an element of its own for each of the fusions of P (B, N, n, n)."""
+    B, N, n, _ = P.shape
+    if name == "cross_covariance":
+        return np.zeros((B, N, N, n, n))
+    R = np.random.default_rng(2).uniform(0.1, 1.0, (B, N, N))
+    R = np.maximum(R, R.swapaxes(1, 2))
+    R[:, range(N), range(N)] = 1.0
+    return np.asarray(R)
 
 
 def stacked(x: Floats, P: Floats) -> tuple[Floats, Floats]:
@@ -156,8 +169,9 @@ def measure(
         ours: list[float] = []
         a: list[float] = []
         b: list[float] = []
+        given: dict[str, Any] = {key: own(key, P) if value == "own" else value for key, value in options.items()}
         for _ in range(rounds):
-            ours.append(clock(lambda: fuse(rule, x, P, **options)))  # noqa: B023
+            ours.append(clock(lambda: fuse(rule, x, P, **given)))  # noqa: B023
             a.append(clock(lambda: stacked(x, P)))
             if "criterion" in options and len(b) < 3:
                 b.append(clock(lambda: one_by_one(x[:some], P[:some], rule, options)) * B / some)  # noqa: B023

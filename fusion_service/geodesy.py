@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Bools, Floats
 from fusion_service.errors import FusionError
 from fusion_service.linalg import congruence, matvec, outer, to_first, to_last
 from schemas import Ecef, Enu, Frame, Height, Local
@@ -26,6 +26,7 @@ __all__ = [
     "enu_to_geodetic",
     "geodetic_to_ecef",
     "geodetic_to_enu",
+    "surface",
     "transform",
     "vertical",
 ]
@@ -165,19 +166,11 @@ def _on_surface(
     x: Floats, P: Floats, space: tuple[str, ...], source: Frame, target: Frame, height: Height
 ) -> tuple[Floats, Floats]:
     """States without z, x (n, B) and P (n, n, B), moved along the surface of equal altitude."""
-    (e, n, u), centre = _axes(source)
+    (e, n, u), _ = _axes(source)
     to_axes, to_centre = _axes(target)
     ix, iy = space.index("x"), space.index("y")
-    foot = [centre[i] + e[i] * x[ix] + n[i] * x[iy] for i in range(3)]
     assert isinstance(source, Enu)
-    z = (height.value - source.alt) - (x[ix] * x[ix] + x[iy] * x[iy]) / (2 * A)
-    for _ in range(NEWTON_STEPS):
-        normal, altitude = _normal_and_altitude(*(foot[i] + u[i] * z for i in range(3)))
-        z = z - (altitude - height.value) / _dot(u, normal)
-    place = [foot[i] + u[i] * z for i in range(3)]
-    normal, altitude = _normal_and_altitude(*place)
-    lost = ~(np.abs(altitude - height.value) <= MAX_HEIGHT_ERROR)
-
+    place, _, normal, lost = _meeting(x[ix], x[iy], source, height.value)
     slope = 1 / _dot(u, normal)
     dz = (-_dot(e, normal) * slope, -_dot(n, normal) * slope)
     along = [[axis[i] + u[i] * d for i in range(3)] for axis, d in zip((e, n), dz, strict=True)]
@@ -196,6 +189,32 @@ def _on_surface(
     moved[:, lost] = np.nan
     covariance[:, :, lost] = np.nan
     return moved, covariance
+
+
+def surface(x: Floats, y: Floats, origin: Enu, alt: float) -> tuple[Floats, Floats, Floats, Floats]:
+    """Where verticals of `origin` through (x, y), m, (B,) meet the surface `alt` m above the ellipsoid: z there, dz/dx,
+    dz/dy and dz/dalt (B,). NaN where they miss it, thousands of km away."""
+    with np.errstate(all="ignore"):
+        (e, n, u), _ = _axes(origin)
+        _, z, normal, lost = _meeting(x, y, origin, alt)
+        rise = 1 / _dot(u, normal)
+        found = (z, -_dot(e, normal) * rise, -_dot(n, normal) * rise, rise)
+        z, slope_x, slope_y, rise = (np.where(lost, np.nan, part) for part in found)
+    return z, slope_x, slope_y, rise
+
+
+def _meeting(x: Floats, y: Floats, origin: Enu, alt: float) -> tuple[list[Floats], Floats, Triple, Bools]:
+    """The place in ECEF where verticals of `origin` through (x, y) reach the altitude, z there, the normal of the
+    ellipsoid below it, and which never do."""
+    (e, n, u), centre = _axes(origin)
+    foot = [centre[i] + e[i] * x + n[i] * y for i in range(3)]
+    z = (alt - origin.alt) - (x * x + y * y) / (2 * A)
+    for _ in range(NEWTON_STEPS):
+        normal, altitude = _normal_and_altitude(*(foot[i] + u[i] * z for i in range(3)))
+        z = z - (altitude - alt) / _dot(u, normal)
+    place = [foot[i] + u[i] * z for i in range(3)]
+    normal, altitude = _normal_and_altitude(*place)
+    return place, z, normal, ~(np.abs(altitude - alt) <= MAX_HEIGHT_ERROR)
 
 
 def _pairs(space: tuple[str, ...]) -> list[tuple[int, int, int, int]]:

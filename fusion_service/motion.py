@@ -52,6 +52,8 @@ def predict(
     the states, of which a turn asks where up is.
     Raises ValueError for a negative or NaN `dt`.
     """
+    if not np.any(dt):
+        return means.copy(), covariances.copy()
     moves, noise = transition(motion, space, means, dt, frame)
     with np.errstate(all="ignore"):
         if motion.kind == "ct" and turns(space, frame):

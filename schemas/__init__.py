@@ -33,6 +33,7 @@ from schemas.numeric import FAULTS, check_numbers
 from schemas.spaces import (
     COMPONENTS,
     MOTIONS,
+    UNKNOWN_SIGMA,
     Coverage,
     Disk,
     Ecef,
@@ -57,6 +58,7 @@ __all__ = [
     "REALM",
     "REASONS",
     "STATUSES",
+    "UNKNOWN_SIGMA",
     "VERSION",
     "Coverage",
     "Decisions",

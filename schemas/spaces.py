@@ -14,6 +14,7 @@ from typing import ClassVar, TypeAlias
 __all__ = [
     "COMPONENTS",
     "MOTIONS",
+    "UNKNOWN_SIGMA",
     "Coverage",
     "Disk",
     "Ecef",
@@ -40,6 +41,13 @@ COMPONENTS: dict[str, str] = {
     "turn_rate": "rad/s",
 }
 """Component name -> unit. In an ENU frame x is east, y north, z up; turn_rate is positive from x to y."""
+
+UNKNOWN_SIGMA: dict[str, float] = {
+    "z": 1e6,
+    **dict.fromkeys(("vx", "vy", "vz", "ax", "ay", "az"), 1e4),
+    "turn_rate": 100.0,
+}
+"""Component name -> the standard deviation from which a density says nothing of it. x and y are always said."""
 
 
 def check_space(space: tuple[str, ...]) -> tuple[str, ...]:

@@ -26,10 +26,14 @@ PLACE = np.array([[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0]])
 
 
 class Tracks(NamedTuple):
-    """N tracks of one target, B times over: reported P (B, N, n, n), joint error covariance J (B, N n, N n)."""
+    """N tracks of one target, B times over: reported P (B, N, n, n), joint error covariance J (B, N n, N n). Of filters
+    what follows of it from the covariances they report one after the other (`fusion_service/centre/derived.py`),
+    `derived` (B, N, N, n, n), and what `left` (B, N, n, n), D_i, their start leaves unknown."""
 
     P: Floats
     J: Floats
+    derived: Floats | None = None
+    left: Floats | None = None
 
 
 class Model(NamedTuple):
@@ -80,18 +84,23 @@ def filtered(start: Tracks, model: Model, steps: int, H: Floats | None = None) -
     move[size:, size:] = model.decay * np.eye(d)
     R = model.R + model.shared**2 * np.eye(d)
     A = np.broadcast_to(np.eye(size + d), J.shape).copy()
+    C = np.zeros((B, N, N, n, n)) if start.derived is None else start.derived
+    left = np.asarray(np.linalg.cholesky(P)) if start.left is None else start.left
     for k in range(steps):
         h = np.broadcast_to(model.H if H is None else H[k], (B, N, d, n))
-        P = model.F @ P @ model.F.T + model.Q
+        before = P = model.F @ P @ model.F.T + model.Q
         K = P @ h.swapaxes(-1, -2) @ np.linalg.inv(h @ P @ h.swapaxes(-1, -2) + R)
         P = P - K @ h @ P
         P = 0.5 * (P + P.swapaxes(-1, -2))
+        told = P @ np.linalg.inv(before)
+        C = told[:, :, None] @ (model.F @ C @ model.F.T + model.Q) @ told[:, None].swapaxes(-1, -2)
+        left = told @ model.F @ left
         A[:, :size, :size] = blocks(np.eye(n) - K @ h)
         A[:, :size, size:] = K.reshape(B, size, d)
         J = A @ (move @ J @ move.T + common) @ A.swapaxes(1, 2)
         J[:, :size, :size] += blocks(K @ model.R @ K.swapaxes(-1, -2))
     J = J[:, :size, :size]
-    return Tracks(P, 0.5 * (J + J.swapaxes(1, 2)))
+    return Tracks(P, 0.5 * (J + J.swapaxes(1, 2)), C, left)
 
 
 def alike(P: Floats, N: int, true: Floats | None = None) -> Tracks:

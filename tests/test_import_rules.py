@@ -16,7 +16,7 @@ GROUND_FLOOR = {
     f"fusion_service.{name}"
     for name in (
         *("linalg", "geodesy", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
-        *("errors", "arrays", "order", "turn"),
+        *("errors", "arrays", "order", "turn", "ways"),
     )
 }
 STANDS_ON = {

@@ -27,7 +27,10 @@ ELSEWHERE = {
 }
 """Pages that are not below docs/: path in the repository, name in the site."""
 SECTIONS = {
-    "Use it": ["tutorial", "operating", "judgement", "motion", "rules", "mixtures", "review", "docker", "wire"],
+    "Use it": [
+        *("tutorial", "operating", "judgement", "tracklets", "motion", "rules", "mixtures", "partial", "review"),
+        *("docker", "wire"),
+    ],
     "How good, how fast": ["measurements", "worlds", "studies", "rules-speed"],
     "API": ["api/*"],
     "Carry it on": ["architecture", "decisions/README", "contributing", "changelog"],

@@ -4,8 +4,8 @@ from fusion_service.centre.centre import Centre, StepResult
 from fusion_service.centre.checkpoint import CheckpointError
 from fusion_service.centre.clock import MessageClock, WallClock
 from fusion_service.centre.era import ClockSet, NewEra
+from fusion_service.centre.events import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.fusion import FusionCentre
-from fusion_service.centre.intake import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.intensity import IntensityCentre
 from fusion_service.centre.judging import Outcome, View, judge
 from fusion_service.centre.making import make_centre

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from fusion_service import linalg
 from fusion_service.arrays import Floats
 from fusion_service.centre import kinship
+from fusion_service.centre.evidence import chi2_by_size
 from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.densities import Mixtures
-from fusion_service.metrics import chi2_quantile
-from fusion_service.motion import predict
 from schemas import Entry, Frame, Motion
 
 __all__ = ["predict_tracks", "usable_rows", "write_back"]
@@ -47,8 +47,11 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
             leave_out(source)
             continue
         age = (time - table.time) / 1e9
-        predicted = predict_tracks(table, said.motion, source.space, config.space, age, intake.frame)
-        predicted = _shifted(predicted, shift_of(intake, source))
+        predicted = predict_tracks(
+            table, said.motion, source.space, config.space, age, intake.frame, config.unknown_speed
+        )
+        if config.kind == "tracks":
+            predicted = _shifted(predicted, shift_of(intake, source))
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
@@ -62,7 +65,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         interval.append(table.interval[sound])
         lost.append(np.full(count, source.alive is False, dtype=np.bool_))
         gate = config.gate if said.gate is None else said.gate
-        gates.append(np.full(count, chi2_quantile(gate, len(config.space))))
+        gates.append(np.tile(chi2_by_size(gate, len(config.space))[:, None], count))
     if not parts:
         parts.append(intake.nothing())
     tracks = join_tracks(parts)
@@ -75,7 +78,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         may_start=_joined(starts, np.bool_) & ~kinship.stale_echo(tracks, kin.echo, time, config),
         interval=_joined(interval, np.int64),
         lost=_joined(lost, np.bool_),
-        gate=_joined(gates, np.float64),
+        gate=np.concatenate([np.zeros((len(config.space) + 1, 0)), *gates], axis=1),
         fresh=tracks.updated > tracks.judged,
         kept=kept,
         kin=kin,
@@ -102,26 +105,21 @@ def predict_tracks(
     wanted: tuple[str, ...],
     dt: NDArray[np.float64],
     frame: Frame | None,
+    speed: float = 100.0,
+    age: NDArray[np.float64] | float = 0.0,
 ) -> Columns:
-    """Densities in `frame`, `dt` (T,) seconds later, marginalised from `space` to the components `wanted`."""
-    at = [space.index(component) for component in wanted]
-    some = np.ix_(at, at)
-    components = len(tracks.log_weight)
-    if not components:
-        mean, covariance = predict(motion, space, tracks.mean, tracks.covariance, dt, frame)
-        parts = no_parts(len(at), len(dt))
-        return replace(tracks, mean=mean[at], covariance=covariance[some], **dict(zip(PARTS, parts, strict=True)))
-    n, count = tracks.mean.shape
-    means, covariances = predict(
-        motion,
-        space,
-        tracks.part_mean.reshape(n, -1),
-        tracks.part_covariance.reshape(n, n, -1),
-        np.tile(dt, components),
-        frame,
-    )
-    means = means.reshape(n, components, count)[at]
-    covariances = covariances.reshape(n, n, components, count)[some]
+    """Densities in `space` and `frame`, `dt` (T,) seconds later in the space `wanted`: marginalised to it, and padded
+    where they do not know of a component (see `partial`). speed: one sigma of that of targets, where it is not known;
+    age (T,): seconds for which it was not already."""
+    unknown = Unknown.of(wanted)
+    known = Unknown.of(space).known(tracks.covariance)
+    how = dt, unknown, speed, age, frame
+    if not len(tracks.log_weight):
+        one, spread = tracks.mean[:, None], tracks.covariance[:, :, None]
+        one, spread = predict_known(motion, space, one, spread, known, *how)
+        parts = no_parts(len(wanted), len(dt))
+        return replace(tracks, mean=one[:, 0], covariance=spread[:, :, 0], **dict(zip(PARTS, parts, strict=True)))
+    means, covariances = predict_known(motion, space, tracks.part_mean, tracks.part_covariance, known, *how)
     mean, covariance = Mixtures(tracks.log_weight, means, covariances).moments()
     return replace(tracks, mean=mean, covariance=covariance, part_mean=means, part_covariance=covariances)
 

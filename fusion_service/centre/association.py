@@ -28,6 +28,7 @@ LIGHTEST = 0.05
 """Components of less weight do not open a gate."""
 SOUND = 1e-10
 """Least pivot, relative to its variance, of what is inverted."""
+SOUND_WIDE = 1e-13 if np.finfo(np.longdouble).eps < 2e-19 else 1.0
 TIERS = (8, 64)
 """Neighbours sought of a row, and again of one that has as many; one that has the last number is crowded."""
 CROWD = 256
@@ -51,11 +52,12 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
 def uniform_ci(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
     """Covariance intersection with equal weights: (k, n, B), (k, n, n, B) -> (n, B), (n, n, B).
 
-    Where rounding could spoil the result (a correlation singular to within `SOUND`), the source with the
-    smallest determinant stands for all.
+    Where rounding could spoil the result (a correlation singular to within `SOUND`) it is computed in longdouble; where
+    it could even there (`SOUND_WIDE`), the source with the smallest determinant stands for all.
     """
     if len(means) == 1:
         return means[0], covariances[0]
+    least_sound = SOUND if means.dtype == np.float64 else SOUND_WIDE
     information, _, least = linalg.sweep(covariances[0])
     vector = linalg.matvec(information, means[0])
     for mean, covariance in zip(means[1:], covariances[1:], strict=True):
@@ -65,9 +67,13 @@ def uniform_ci(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
         least = np.minimum(least, margin)
     covariance, _, margin = linalg.sweep(information)
     x, C = linalg.matvec(covariance, vector), covariance * float(len(means))
-    sound = (np.minimum(least, margin) > SOUND) & np.isfinite(x).all(axis=0) & np.isfinite(C).all(axis=(0, 1))
+    sound = (np.minimum(least, margin) > least_sound) & np.isfinite(x).all(axis=0) & np.isfinite(C).all(axis=(0, 1))
     bad = np.flatnonzero(~sound)
-    if len(bad):
+    if len(bad) and means.dtype == np.float64:
+        x[:, bad], C[:, :, bad] = uniform_ci(
+            means[:, :, bad].astype(np.longdouble), covariances[:, :, :, bad].astype(np.longdouble)
+        )
+    elif len(bad):
         size = np.stack([linalg.logdet(P[:, :, bad]) for P in covariances])
         best = np.argmin(np.where(np.isfinite(size), size, np.inf), axis=0)
         x[:, bad] = means[best, :, bad].T

@@ -12,12 +12,12 @@ from fusion_service.metrics import assign_near
 __all__ = ["group"]
 
 
-def group(at: Ints, source: Ints, pairs: Pairs, gate: NDArray[np.float64]) -> Ints:
+def group(at: Ints, source: Ints, pairs: Pairs) -> Ints:
     """The group (A,) of each of the rows `at`, which are in order: 0, 1, ... by the first row of each.
 
     At most one row of each source is in a group, each two within the gate. Sources come one after the other; the rows
     of each are given to the groups so far by the optimal assignment of the mean of d2 + log det to their members, where
-    staying apart costs the gate (M,), of two the wider; for two sources that is the best of all groupings. source:
+    staying apart costs the gate of a pair; for two sources that is the best of all groupings. source:
     (M,) of all rows, `pairs` of rows, (first, second) in order.
     """
     label = np.full(len(source), -1, dtype=np.intp)
@@ -26,7 +26,7 @@ def group(at: Ints, source: Ints, pairs: Pairs, gate: NDArray[np.float64]) -> In
     some = mine[pairs.first] & mine[pairs.second]
     first, second = pairs.first[some], pairs.second[some]
     top = pairs.spread[some].max(initial=-np.inf)
-    gain = 1e-6 + (np.maximum(gate[first], gate[second]) - pairs.distance[some]) + (top - pairs.spread[some])
+    gain = 1e-6 + (pairs.gate[some] - pairs.distance[some]) + (top - pairs.spread[some])
     size = np.zeros(len(at), dtype=np.intp)
     count = 0
     for name in np.unique(source[at]).tolist():

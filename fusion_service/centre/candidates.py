@@ -8,18 +8,20 @@ with a track as that track is without the row's own source, so that no source vo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints
-from fusion_service.centre.association import candidate_pairs, overlap, pair_distance
+from fusion_service.centre.association import candidate_pairs, overlap
+from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import Judgement
 from fusion_service.centre.identity import Terms
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.meeting import Meeting
+from fusion_service.centre.partial import Unknown, apart
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.densities import Mixtures
 
@@ -31,16 +33,19 @@ MOST_RIVALS = 32
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pairs:
-    """K pairs (first, second), in order, with d2 and log det of the sum of their covariances."""
+    """K pairs (first, second), in order, with d2 and log det of the sum of their covariances over the `size` components
+    that both know, and the d2 within which they are a pair."""
 
     first: Ints
     second: Ints
     distance: Floats
     spread: Floats
+    size: Ints
+    gate: Floats
 
     def take(self, some: NDArray[np.bool_] | Ints) -> Pairs:
         """Those given."""
-        return Pairs(self.first[some], self.second[some], self.distance[some], self.spread[some])
+        return Pairs(*(getattr(self, one.name)[some] for one in fields(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -60,7 +65,7 @@ class Candidates:
 
 
 def find_candidates(
-    rows: Rows, now: Picture, meeting: Meeting, judged: Judgement, gate: float, places: list[int]
+    rows: Rows, now: Picture, meeting: Meeting, judged: Judgement, tests: Tests, places: list[int]
 ) -> Candidates:
     """All that may meet. now: the picture predicted to the step."""
     tracks, agreed = rows.tracks, judged.agreed
@@ -73,19 +78,21 @@ def find_candidates(
     covariances = np.concatenate([covariance[:, :, known], tracks.covariance[:, :, loose]], axis=2)
     source = np.concatenate([np.full(len(known), -1), rows.source[loose]])
     compartment = np.concatenate([meeting.compartment_of_tracks[known], meeting.compartment_of_rows[loose]])
+    gates = np.concatenate([np.tile(tests.gate[:, None], len(known)), rows.gate[:, loose]], axis=1)
+    seen = np.asarray(tests.unknown.known(covariances).all(axis=1))
+    places = [place for place in places if seen[place]]  # where a height is not known, pairs are sought on the plane
     sigma = np.sqrt(sum(covariances[place, place] for place in places))
-    gates = np.concatenate([np.full(len(known), gate), rows.gate[loose]])
-    i, j = candidate_pairs(means[places], sigma, float(np.sqrt(gates.max(initial=gate))), source)
+    i, j = candidate_pairs(means[places], sigma, float(np.sqrt(gates.max(initial=tests.gate[-1]))), source)
     same = compartment[i] == compartment[j]
     i, j = i[same], j[same]
     first_row, second_row = i >= len(known), j >= len(known)
     node = np.concatenate([known, loose])
     both, none = ~second_row, first_row
     parts = _mixtures(now, known, rows, loose)
-    pairs_gg = _gated(means, covariances, i[both], j[both], gates, parts)
-    pairs_rr = _gated(means, covariances, i[none], j[none], gates, parts)
+    pairs_gg = _gated(means, covariances, i[both], j[both], gates, parts, tests.unknown)
+    pairs_rr = _gated(means, covariances, i[none], j[none], gates, parts, tests.unknown)
     mixed = ~both & ~none
-    lookup = _Without(rows, now, judged, mean, covariance)
+    lookup = _Without(rows, now, judged, mean, covariance, tests.unknown)
     row, track = node[j[mixed]], node[i[mixed]]
     joins = lookup.pairs(row, track, _own_mixtures(now, rows))
     row, track = _near_own(rows, now, judged.inside, pairs_gg, known)
@@ -93,8 +100,8 @@ def find_candidates(
     own = np.full(len(tracks.id), np.nan)
     mine = np.unique(rivals.first)
     own[mine] = lookup.cost(mine, now.find(tracks.link[mine]))
-    gg = Pairs(known[pairs_gg.first], known[pairs_gg.second], pairs_gg.distance, pairs_gg.spread)
-    rr = Pairs(node[pairs_rr.first], node[pairs_rr.second], pairs_rr.distance, pairs_rr.spread)
+    gg = replace(pairs_gg, first=known[pairs_gg.first], second=known[pairs_gg.second])
+    rr = replace(pairs_rr, first=node[pairs_rr.first], second=node[pairs_rr.second])
     return _said(Candidates(gg, joins, rivals, rr, own, loose, mean, covariance), rows, now, meeting)
 
 
@@ -123,8 +130,10 @@ def _allowed(pairs: Pairs, say: Callable[[Ints, Ints], Terms]) -> Pairs:
 class _Without:
     """Global tracks without a given source: the fusion of the others where there are others, else the prediction."""
 
-    def __init__(self, rows: Rows, now: Picture, judged: Judgement, mean: Floats, covariance: Floats) -> None:
-        self._rows, self._now, self._judged = rows, now, judged
+    def __init__(
+        self, rows: Rows, now: Picture, judged: Judgement, mean: Floats, covariance: Floats, unknown: Unknown
+    ) -> None:
+        self._rows, self._now, self._judged, self._unknown = rows, now, judged, unknown
         self._mean, self._covariance = mean, covariance
         self._width = max(len(now.id), 1)
         inside = judged.inside
@@ -149,41 +158,55 @@ class _Without:
             covariance[:, :, alone] = self._now.covariance[:, :, track[alone]]
         return mean, covariance
 
-    def _distances(self, row: Ints, track: Ints) -> tuple[Floats, Floats]:
-        distance, size = np.empty(len(row)), np.empty(len(row))
+    def _distances(self, row: Ints, track: Ints) -> tuple[Floats, Floats, Ints]:
+        distance, size, count = np.empty(len(row)), np.empty(len(row)), np.empty(len(row), dtype=np.intp)
         for part in linalg.blocks(len(self._mean), len(row)):
             mean, covariance = self.state(row[part], track[part])
             spread = covariance + self._rows.tracks.covariance[:, :, row[part]]
-            distance[part] = linalg.quadratic(spread, self._rows.tracks.mean[:, row[part]] - mean)
-            size[part] = linalg.logdet(spread)
-        return distance, size
+            offset = self._rows.tracks.mean[:, row[part]] - mean
+            distance[part], size[part], count[part] = apart(spread, offset, self._unknown)
+        return distance, size, count
 
     def cost(self, row: Ints, track: Ints) -> Floats:
         """d2 + log det (K,)."""
-        distance, spread = self._distances(row, track)
+        distance, spread, _ = self._distances(row, track)
         return distance + spread
 
     def pairs(self, row: Ints, track: Ints, mixtures: tuple[Mixtures, Mixtures] | None) -> Pairs:
         """Those of the pairs within the gate of the row, in order; of mixtures the d2 of their nearest components."""
         order = np.lexsort((track, row))
         row, track = row[order], track[order]
-        distance, spread = self._distances(row, track)
+        distance, spread, size = self._distances(row, track)
         if mixtures is not None:
             mine, its = mixtures
             several = np.isfinite(mine.log_weights).sum(axis=0)[row] > 1
             several |= np.isfinite(its.log_weights).sum(axis=0)[track] > 1
             at = np.flatnonzero(several)
-            distance[at], spread[at] = overlap(mine.take(row[at]), its.take(track[at]))
-        return Pairs(row, track, distance, spread).take(distance <= self._rows.gate[row])
+            distance[at], spread[at] = _overlap(mine.take(row[at]), its.take(track[at]), self._unknown)
+        gate = self._rows.gate[size, row]
+        return Pairs(row, track, distance, spread, size, gate).take(distance <= gate)
 
 
-def _gated(means: Floats, covariances: Floats, i: Ints, j: Ints, gates: Floats, parts: Mixtures | None) -> Pairs:
-    distance, spread = pair_distance(means, covariances, i, j)
+def _overlap(first: Mixtures, second: Mixtures, unknown: Unknown) -> tuple[Floats, Floats]:
+    """`association.overlap` of K pairs over what both know."""
+    distance, spread = overlap(first, second)
+    return distance, spread + unknown.common(first.covariances[:, :, 0] + second.covariances[:, :, 0])[1]
+
+
+def _gated(
+    means: Floats, covariances: Floats, i: Ints, j: Ints, gates: Floats, parts: Mixtures | None, unknown: Unknown
+) -> Pairs:
+    distance, spread, size = np.empty(len(i)), np.empty(len(i)), np.empty(len(i), dtype=np.intp)
+    for part in linalg.blocks(len(means), len(i)):
+        a, b = i[part], j[part]
+        both, offset = covariances[:, :, a] + covariances[:, :, b], means[:, a] - means[:, b]
+        distance[part], spread[part], size[part] = apart(both, offset, unknown)
     if parts is not None:
         several = np.isfinite(parts.log_weights).sum(axis=0) > 1
         at = np.flatnonzero(several[i] | several[j])
-        distance[at], spread[at] = overlap(parts.take(i[at]), parts.take(j[at]))
-    return Pairs(i, j, distance, spread).take(distance <= np.maximum(gates[i], gates[j]))
+        distance[at], spread[at] = _overlap(parts.take(i[at]), parts.take(j[at]), unknown)
+    gate = np.maximum(gates[size, i], gates[size, j])
+    return Pairs(i, j, distance, spread, size, gate).take(distance <= gate)
 
 
 def _near_own(rows: Rows, now: Picture, inside: Ints, near: Pairs, known: Ints) -> tuple[Ints, Ints]:

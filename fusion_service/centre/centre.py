@@ -22,8 +22,9 @@ from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
+from fusion_service.centre.events import Event
 from fusion_service.centre.ids import Ids
-from fusion_service.centre.intake import Event, Intake
+from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal, start_event
 from fusion_service.centre.judging import View
 from fusion_service.centre.labels import Labels

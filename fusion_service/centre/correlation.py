@@ -1,23 +1,44 @@
-"""What a step's fusion is told of the correlation of local tracks: bounds between declared groups of sources.
+"""What a step's fusion is told of the correlation of local tracks: bounds between declared groups of sources, or what
+`derived` knows of each pair.
 
 A source's group is what its SensorInfo says (`correlation_group`), else what the config says of it, with `override` the
 other way round; a source without one is a group of its own, named as itself.
+
+Derived: `bci` takes the bound of each pair. `bar-shalom-campo` takes the cross-covariances where all pairs of a target
+are known but for less than `ENOUGH` of their correlation; elsewhere, and where they make no covariance, it is `bci`
+under the bounds there are, and `ci` where there are none. `auto` is the same, under what is derived or declared.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.centre.derived import Followed
 from fusion_service.centre.intake import Intake
+from fusion_service.centre.lifecycle import WAYS
 from fusion_service.centre.rows import Rows
-from fusion_service.config import CentreConfig
-from fusion_service.config.correlation import group_bounds
+from fusion_service.centre.sources import Source
+from fusion_service.config import CentreConfig, SourceConfig
+from fusion_service.config.correlation import group_bounds, is_derived
 from fusion_service.rules import Fused, fuse_last
+from schemas import Motion
 
-__all__ = ["Correlation", "declared_correlation"]
+__all__ = ["AUTO", "Correlation", "Ways", "declared_correlation", "declared_motions", "sound_rows"]
+
+AUTO = "auto"
+Ways = NDArray[np.uint8]
+BY_CROSS, BY_DERIVED, BY_DECLARED, BY_CI = (
+    WAYS.index(way) for way in ("bar-shalom-campo derived", "bci derived", "bci declared", "ci")
+)
+EACH = ("max_correlation", "cross_covariance")
+"""Options that have an element for each fusion."""
+ENOUGH = 0.05
+"""What may be left of the unknown start of a pair whose cross-covariance is taken as known."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,33 +46,112 @@ class Correlation:
     """How the rows of a step are fused by the rule of the config, with what is known of their correlation.
 
     groups (S,): of each source, by sorted name, the number of its group; bounds (G, G): between two of the groups.
-    None where nothing is declared by groups.
+    None where nothing is declared by groups. followed: pairs whose cross-covariance is derived.
     """
 
     config: CentreConfig
     groups: Ints | None = None
     bounds: Floats | None = None
+    followed: Followed | None = None
 
-    def fuse(self, rows: Rows, members: Ints, means: Floats, covariances: Floats, weights: Floats | None) -> Fused:
-        """Fuse rows `members` (B, N), of means (N, n, B) and covariances (N, n, n, B); what cannot be fused is NaN."""
-        options = dict(self.config.rule_options)
-        if self.groups is not None and self.bounds is not None:
-            group = self.groups[rows.source[members.T]]
-            R = self.bounds[group[:, None], group[None]]
-            R[range(len(R)), range(len(R))] = 1.0
-            options["max_correlation"] = R
-        return fuse_last(self.config.rule, means, covariances, weights, influence=True, **options)
+    def fuse(
+        self, rows: Rows, members: Ints, means: Floats, covariances: Floats, weights: Floats | None, some: Ints
+    ) -> tuple[Fused, Ways]:
+        """Fuse rows `members` (B, N), of means (N, m, B) and covariances (N, m, m, B) of the components `some` (m,) of
+        the space; what cannot be fused is NaN. And what each was fused by (B,): index into `lifecycle.WAYS`."""
+        rule, options = self.config.rule, dict(self.config.rule_options)
+        if "scales" in options and len(some) < len(self.config.space):
+            options["scales"] = np.asarray(options["scales"], dtype=np.float64)[some]
+        if rule == AUTO or is_derived(rule, options):
+            return self._as_known(rows, members, means, covariances, some, options)
+        if self.groups is not None:
+            options["max_correlation"] = self._between(rows, members)
+        fused = fuse_last(rule, means, covariances, weights, influence=True, **options)
+        return fused, np.zeros(len(members), dtype=np.uint8)
+
+    def _between(self, rows: Rows, members: Ints) -> Floats:
+        """Bounds (N, N, B) that are declared."""
+        size, N = members.shape
+        if self.groups is None or self.bounds is None:
+            return np.ones((N, N, size))
+        group = self.groups[rows.source[members.T]]
+        R = self.bounds[group[:, None], group[None]]
+        R[range(N), range(N)] = 1.0
+        return R
+
+    def _as_known(
+        self, rows: Rows, members: Ints, means: Floats, covariances: Floats, some: Ints, options: dict[str, Any]
+    ) -> tuple[Fused, Ways]:
+        """By the cross-covariances where all of a target are known; else under the bounds, those derived and those
+        declared; else by `ci`."""
+        size, N = members.shape
+        n = means.shape[1]
+        few = {name: value for name, value in options.items() if name not in ("max_correlation", "cross")}
+        R, C, unknown = np.ones((N, N, size)), np.zeros((N, N, n, n, size)), np.ones(size)
+        if self.followed is not None and N > 1:
+            R, C, unknown = self.followed.of(members)
+            C = C[:, :, some][:, :, :, some]
+        derived = (R < 1.0).any(axis=(0, 1))
+        R = np.minimum(R, self._between(rows, members))
+        bounded = (R < 1.0).any(axis=(0, 1))
+        known = (unknown < ENOUGH) & (self.config.rule != "bci")
+        exact = _part("bar-shalom-campo", means, covariances, known, cross_covariance=C)
+        known &= np.isfinite(exact.covariance[0, 0]) & (exact.covariance[0, 0] > 0.0)
+        bounded &= ~known
+        under = _part("bci", means, covariances, bounded, max_correlation=R, **few)
+        neither = ~known & ~bounded
+        safe = _part("ci", means, covariances, neither, **few)
+        columns = zip(_columns(exact), _columns(under), _columns(safe), strict=True)
+        fused = Fused(*(np.where(known, a, np.where(bounded, b, c)) for a, b, c in columns))
+        way = np.where(known, BY_CROSS, np.where(bounded, np.where(derived, BY_DERIVED, BY_DECLARED), BY_CI))
+        return fused, way.astype(np.uint8)
 
 
-def declared_correlation(intake: Intake, config: CentreConfig) -> Correlation:
-    """What the sources declare of it now."""
-    bounds = group_bounds(config.rule_options) if config.rule == "bci" else None
+def _part(rule: str, means: Floats, covariances: Floats, some: Bools, **options: Any) -> Fused:
+    """The fusions of some elements, in a batch in which the others are NaN."""
+    N, n, size = means.shape
+    whole = Fused(*(np.full((*shape, size), np.nan) for shape in ((n,), (n, n), (N,), (N,))))
+    if some.any():
+        options |= {name: options[name][..., some] for name in EACH if name in options}
+        part = fuse_last(rule, means[..., some], covariances[..., some], influence=True, **options)
+        for column, wide in zip(_columns(part), _columns(whole), strict=True):
+            wide[..., some] = column
+    return whole
+
+
+def _columns(fused: Fused) -> tuple[Floats, Floats, Floats, Floats]:
+    assert fused.influence is not None
+    return fused.mean, fused.covariance, fused.weights, fused.influence
+
+
+def declared_correlation(intake: Intake, config: CentreConfig, followed: Followed | None = None) -> Correlation:
+    """What the sources declare of it now, and what is known of pairs of rows."""
+    bounds = group_bounds(config.rule_options) if config.rule in ("bci", AUTO) else None
     if bounds is None:
-        return Correlation(config)
+        return Correlation(config, followed=followed)
     named = [intake.declared(source).correlation_group or name for name, source in sorted(intake.sources.items())]
     groups = sorted(set(named))
     number = {name: i for i, name in enumerate(groups)}
-    between = np.array([[bounds.of(first, second) for second in groups] for first in groups]).reshape(
-        len(groups), len(groups)
-    )
-    return Correlation(config, np.array([number[name] for name in named], dtype=np.intp), between)
+    size = len(groups), len(groups)
+    between = np.array([[bounds.of(first, second) for second in groups] for first in groups]).reshape(size)
+    return Correlation(config, np.array([number[name] for name in named], dtype=np.intp), between, followed)
+
+
+def declared_motions(intake: Intake) -> list[Motion | None]:
+    """How tracks of each source, by sorted name, move: None where nobody says so, or where the centre's space is not
+    all that it estimates, so that what it reports there is not a filter of its own."""
+    return [_motion(intake, source) for _, source in sorted(intake.sources.items())]
+
+
+def _motion(intake: Intake, source: Source) -> Motion | None:
+    own = intake.config.source(source.name)
+    known = source.info is not None or own.override or own.motion != SourceConfig().motion
+    whole = set(source.space) == set(intake.config.space)
+    return intake.declared(source).motion if known and whole else None
+
+
+def sound_rows(rows: Rows) -> Bools:
+    """The rows (M,) that are one Gaussian."""
+    if not len(rows.tracks.log_weight):
+        return np.ones(len(rows.source), dtype=np.bool_)
+    return np.asarray(np.isfinite(rows.tracks.log_weight).sum(axis=0) <= 1)

@@ -27,11 +27,12 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import Rows
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import chi2_quantile
 
-__all__ = ["LOW", "PairEvidence", "RivalLinks", "Tests"]
+__all__ = ["LOW", "PairEvidence", "RivalLinks", "Tests", "chi2_by_size"]
 
 LOW = 12.0
 """Least sum of a rival: how much it must make good before it counts."""
@@ -45,37 +46,46 @@ WEIGHT = ((0, 10, 30), (0.0, 0.1, 0.5))
 since the first pairing of a formation is mostly wrong; two mature ones A together."""
 
 
-@dataclass(frozen=True, slots=True)
+def chi2_by_size(probability: float, n: int) -> Floats:
+    """The chi-square quantile (n + 1,) by how many of n components are in common, 0 for none."""
+    return np.array([0.0, *(chi2_quantile(probability, k) for k in range(1, n + 1))])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Tests:
-    """The thresholds of a config: bound A of the sums; gate, keep and merge, d2 at the quantiles of the config."""
+    """The thresholds of a config: bound A of the sums; gate, keep and merge (n + 1,), d2 at the quantiles of the config
+    by how many components are in common; unknown: which these are. A `size` (M,) is a number of them."""
 
     bound: float
-    gate: float
-    keep: float
-    merge: float
+    gate: Floats
+    keep: Floats
+    merge: Floats
+    unknown: Unknown
 
     @classmethod
     def of(cls, config: CentreConfig) -> Tests:
         """Of a centre's settings."""
         n = len(config.space)
-        quantiles = [chi2_quantile(p, n) for p in (config.gate, config.keep_gate, config.merge_gate)]
-        return cls(float(-np.log(config.error_rate)), *quantiles)
+        gate, keep, merge = (chi2_by_size(p, n) for p in (config.gate, config.keep_gate, config.merge_gate))
+        unknown = Unknown.of(config.space, config.unknown_speed, config.manoeuvre)
+        return cls(float(-np.log(config.error_rate)), gate, keep, merge, unknown)
 
-    def agreement(self, distance: Floats) -> Floats:
+    def agreement(self, distance: Floats, size: Ints) -> Floats:
         """What a datum at d2 `distance` (M,) from the others adds to the sum of its link."""
-        nearer = np.minimum(SLOPE * np.maximum(self.keep - distance, 0.0), self.bound / 4)
-        return nearer - self.bound / 2 * self._beyond(distance) ** 2
+        nearer = np.minimum(SLOPE * np.maximum(self.keep[size] - distance, 0.0), self.bound / 4)
+        return nearer - self.bound / 2 * self._beyond(distance, size) ** 2
 
-    def jump(self, distance: Floats) -> Floats:
+    def jump(self, distance: Floats, size: Ints) -> Floats:
         """What a datum at d2 `distance` (M,) beyond the gate of the prediction takes from the sum of its link."""
-        return -self.bound * self._beyond(distance) ** 2
+        return -self.bound * self._beyond(distance, size) ** 2
 
-    def _beyond(self, distance: Floats) -> Floats:
-        return np.clip((distance - self.keep) / (FAR * self.keep), 0.0, 1.0)
+    def _beyond(self, distance: Floats, size: Ints) -> Floats:
+        keep = self.keep[size]
+        return np.clip((distance - keep) / (FAR * keep), 0.0, 1.0)
 
-    def sameness(self, distance: Floats) -> Floats:
+    def sameness(self, distance: Floats, size: Ints) -> Floats:
         """What a datum adds to the sum for a merge of two global tracks at d2 `distance`."""
-        return np.clip(MERGE_SLOPE * (self.merge - distance), -self.bound / 2, self.bound / 2)
+        return np.clip(MERGE_SLOPE * (self.merge[size] - distance), -self.bound / 2, self.bound / 2)
 
     def weight(self, data: NDArray[np.integer]) -> Floats:
         """What a standing link weighs against an exchange, after so many data (M,)."""

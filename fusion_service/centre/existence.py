@@ -29,6 +29,7 @@ from fusion_service.arrays import Floats
 from fusion_service.centre.association import by_size
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import Rows
 from fusion_service.config import SourceConfig
 from fusion_service.coverage import covers
@@ -112,7 +113,7 @@ def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entr
     hit = np.bincount(at[fresh], minlength=count) > 0
     opinion = np.where(np.isnan(picture.opinion), _logit(config.birth_existence), picture.opinion)
     evidence = picture.evidence.copy()
-    opinion = _opinions(rows, picture, inside[says], opinion, config.existence)
+    opinion = _opinions(rows, picture, inside[says], opinion, config.existence, Unknown.of(config.space))
     gain = np.array([_gain(intake.declared(intake.sources[name])) for name in intake.names()])
     counted = fresh & ~says
     np.add.at(evidence, at[counted], gain[rows.source[inside[counted]]])
@@ -127,7 +128,9 @@ def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entr
     return replace(picture, opinion=opinion, evidence=evidence, existence=_sigmoid(total))
 
 
-def _opinions(rows: Rows, picture: Picture, saying: NDArray[np.intp], opinion: Floats, method: str) -> Floats:
+def _opinions(
+    rows: Rows, picture: Picture, saying: NDArray[np.intp], opinion: Floats, method: str, unknown: Unknown
+) -> Floats:
     """The opinion of all sources that report existence, made anew where one has new data."""
     opinion = opinion.copy()
     new = np.zeros(len(picture.id), dtype=np.bool_)
@@ -136,23 +139,18 @@ def _opinions(rows: Rows, picture: Picture, saying: NDArray[np.intp], opinion: F
         at = picture.find(ids)
         some = new[at]
         if some.any():
-            opinion[at[some]] = _logit(_fused(rows, saying[members[some]], method))
+            opinion[at[some]] = _logit(_fused(rows, saying[members[some]], method, unknown))
     return opinion
 
 
-def _fused(rows: Rows, members: NDArray[np.intp], method: str) -> Floats:
+def _fused(rows: Rows, members: NDArray[np.intp], method: str, unknown: Unknown) -> Floats:
     r = rows.tracks.existence[members]
     k = members.shape[1]
     if method != "geometric" or k > MOST_OVERLAPPING:
         return np.asarray(fuse_existence(r, "consistent" if method == "geometric" else method))
-    sources = [
-        Mixtures(
-            np.zeros((1, len(members))),
-            rows.tracks.mean[:, None, members[:, j]],
-            rows.tracks.covariance[:, :, None, members[:, j]],
-        )
-        for j in range(k)
-    ]
+    means, covariances = unknown.shared(rows.tracks.mean[:, members], rows.tracks.covariance[:, :, members])
+    flat = np.zeros((1, len(members)))
+    sources = [Mixtures(flat, means[:, None, :, j], covariances[:, :, None, :, j]) for j in range(k)]
     overlap = np.exp(power_product(sources, np.full((k, len(members)), 1.0 / k)).log_mass)
     inside = np.clip(r, 1e-12, 1 - 1e-12)
     return np.asarray(fuse_existence(inside, "geometric", overlap=np.clip(np.nan_to_num(overlap), 0.0, 1.0)))

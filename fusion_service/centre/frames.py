@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fusion_service.centre.heights import lifted_space
 from fusion_service.config import CentreConfig
 from fusion_service.geodesy import FrameError, transform
 from schemas import Ecef, Enu, Frame, Local
@@ -31,9 +32,10 @@ class Vote(NamedTuple):
 
 def convertible(vote: Vote, frame: Frame) -> bool:
     """Whether what a source says can be brought into `frame`."""
-    n = len(vote.space)
+    space = lifted_space(vote.space, vote.frame, frame, ("z",) if isinstance(frame, Ecef) else (), 0.0)
+    n = len(space)
     try:
-        transform(np.zeros((0, n)), np.zeros((0, n, n)), vote.space, vote.frame, frame)
+        transform(np.zeros((0, n)), np.zeros((0, n, n)), space, vote.frame, frame)
     except FrameError:
         return False
     return True

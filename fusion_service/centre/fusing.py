@@ -9,7 +9,8 @@ every source by the existence it reports. With recursive memory the predicted la
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,14 +19,16 @@ from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
-from fusion_service.centre.correlation import Correlation
+from fusion_service.centre.blocks import fuse_known
+from fusion_service.centre.correlation import AUTO, Correlation, Ways
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import no_parts, padded
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures, reduce_mixtures
-from fusion_service.rules import Fused, fuse_last
+from fusion_service.rules import MIXTURE_RULES, RULES, Fused, fuse_last
 from fusion_service.rules.mixtures import fuse_mixtures_last
 from schemas import Entry
 
@@ -54,65 +57,102 @@ def fuse_all(
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
     chosen = np.flatnonzero(used)
     mean, covariance, lineage = picture.mean.copy(), picture.covariance.copy(), picture.lineage.copy()
+    way = picture.way.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
     done: list[Ints] = []
+    unknown = Unknown.of(config.space)
     for ids, groups in by_size(tracks.link[chosen]):
         at, members = picture.find(ids), chosen[groups]
-        one, spread, gains = _gaussian(rows, members, known, journal)
-        parts, several = _as_mixtures(rows, members, config)
+        one, spread, gains, by = _gaussian(rows, members, known, unknown, journal)
+        parts, several = _as_mixtures(rows, members, config, unknown)
         if parts is not None:
             one[:, several], spread[:, :, several] = parts.moments()
             mixed.append((at[several], parts))
         if config.memory == "recursive":
             old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
-                _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound)
-        mean[:, at], covariance[:, :, at], state_time[at] = one, spread, time
-        lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory != "restart")
+                _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound, unknown)
+        mean[:, at], covariance[:, :, at], state_time[at], way[at] = one, spread, time, by
+        lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory == "recursive")
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
-    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage)
+    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
     return _with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
-def _gaussian(rows: Rows, members: Ints, known: Correlation, journal: Journal) -> tuple[Floats, Floats, Floats]:
+def _gaussian(
+    rows: Rows, members: Ints, known: Correlation, unknown: Unknown, journal: Journal
+) -> tuple[Floats, Floats, Floats, Ways]:
+    """Means, covariances and gains of groups (B, k), and what each was fused by (see `Correlation.fuse`)."""
     config = known.config
     means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
     covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
     related = kinship.is_related(rows, members) & (config.rule not in kinship.ANY_CORRELATION)
+    by = np.zeros(len(members), dtype=np.uint8)
+    ruled = Ruled(rows, members, known, unknown, journal)
     if related.all():
-        one, spread, gains = _of_kin(rows, members, means, covariances, known)
+        one, spread, gains = ruled.kin(means, covariances)
     else:
         weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
-        fused = known.fuse(rows, members, means, covariances, weights)
-        one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+        one, spread, gains = ruled.fuse(means, covariances, weights, np.arange(len(members)), by)
         if related.any():
-            some = _of_kin(rows, members[related], means[..., related], covariances[..., related], known)
-            one[:, related], spread[:, :, related], gains[:, related] = some
-    bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
-    if bad.any():
-        one[:, bad], spread[:, :, bad] = uniform_ci(means[:, :, bad], covariances[:, :, :, bad])
-        gains[:, bad] = 1.0 / len(means)
-        journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
-    return one, spread, gains
+            some = Ruled(rows, members[related], known, unknown, journal)
+            one[:, related], spread[:, :, related], gains[:, related] = some.kin(
+                means[..., related], covariances[..., related]
+            )
+            by[related] = 0
+    return one, spread, gains, by
 
 
-def _of_kin(
-    rows: Rows, members: Ints, means: Floats, covariances: Floats, known: Correlation
-) -> tuple[Floats, Floats, Floats]:
-    """Groups whose rows have data in common (see `kinship`)."""
+@dataclass(frozen=True, slots=True)
+class Ruled:
+    """Fusion of groups `members` (B, k) of rows by the rule of the config, whatever components each knows."""
 
-    def by_rule(means: Floats, covariances: Floats, which: list[int], some: Ints) -> kinship.Estimates:
-        fused = known.fuse(rows, members[some][:, which], means, covariances, None)
-        return kinship.Estimates(fused.mean, fused.covariance, np.nan_to_num(_influence(fused)))
+    rows: Rows
+    members: Ints
+    known: Correlation
+    unknown: Unknown
+    journal: Journal
 
-    return kinship.fuse_related(means, covariances, kinship.common(rows, members), by_rule)
+    def fuse(
+        self, means: Floats, covariances: Floats, weights: Floats | None, which: Ints, by: Ways, columns: Any = ...
+    ) -> tuple[Floats, Floats, Floats]:
+        """The groups `which` (some of B,), of means (k, n, .) and covariances (k, n, n, .); columns: which of their
+        rows these are, or stand for. Writes `by` (.,), what each was fused by."""
+        name = self.known.config.rule
+
+        def rule(x: Floats, P: Floats, w: Floats | None, some: Ints, at: Ints) -> tuple[Floats, Floats, Floats]:
+            members = self.members[which[at]][:, columns]
+            fused, by[at] = self.known.fuse(self.rows, members, x, P, w, some)
+            one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+            bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
+            if bad.any():
+                one[:, bad], spread[:, :, bad] = uniform_ci(x[:, :, bad], P[:, :, :, bad])
+                gains[:, bad] = 1.0 / len(x)
+                self.journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
+            return one, spread, gains
+
+        information = name == AUTO or RULES[name].information
+        return fuse_known(means, covariances, weights, self.unknown, information, rule)
+
+    def kin(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
+        """Groups whose rows have data in common (see `kinship`): what is derived of rows holds for no result of
+        them."""
+        ruled = replace(self, known=replace(self.known, followed=None))
+
+        def by_rule(x: Floats, P: Floats, which: list[int], some: Ints) -> kinship.Estimates:
+            return kinship.Estimates(*ruled.fuse(x, P, None, some, np.zeros(len(some), dtype=np.uint8), which))
+
+        return kinship.fuse_related(means, covariances, kinship.common(self.rows, self.members), by_rule)
 
 
-def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtures | None, NDArray[np.bool_]]:
-    """The fused mixtures of the groups where a member is one, and which groups these are."""
+def _as_mixtures(
+    rows: Rows, members: Ints, config: CentreConfig, unknown: Unknown
+) -> tuple[Mixtures | None, NDArray[np.bool_]]:
+    """The fused mixtures of the groups where a member is one, and which groups these are; not of those whose members do
+    not know the same, by a mixture rule that is not in information form."""
     components = np.isfinite(rows.tracks.log_weight).sum(axis=0) if len(rows.tracks.log_weight) else None
     several = np.zeros(len(members), dtype=np.bool_)
     alone = members.shape[1] == 1
@@ -121,6 +161,9 @@ def _as_mixtures(rows: Rows, members: Ints, config: CentreConfig) -> tuple[Mixtu
     several = (components[members] > 1).any(axis=1)
     if config.mixture_rule not in kinship.ANY_CORRELATION:
         several &= ~kinship.is_related(rows, members)
+    if not alone and not (MIXTURE_RULES.get(config.mixture_rule) or RULES[config.mixture_rule]).information:
+        known = unknown.known(rows.tracks.covariance[:, :, members])
+        several &= (known == known[:, :, :1]).all(axis=(0, 2))
     if not several.any():
         return None, several
     sources = [rows.tracks.mixtures(members[several, j]) for j in range(members.shape[1])]
@@ -151,21 +194,25 @@ def _shares(rows: Rows, members: Ints) -> Floats:
     return np.where(total > 0, r / np.where(total > 0, total, 1.0), 1.0 / len(r))
 
 
-def _remember(one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, bound: float) -> None:
+def _remember(
+    one: Floats, spread: Floats, gains: Floats, picture: Picture, at: Ints, old: Ints, bound: float,
+    unknown: Unknown,
+) -> None:  # fmt: skip
     """Fuse the result of the local tracks `old` with the predicted last one, under a bound on their correlation."""
     if not len(old):
         return
-    again = fuse_last(
-        "bci",
-        np.stack([one[:, old], picture.mean[:, at[old]]]),
-        np.stack([spread[:, :, old], picture.covariance[:, :, at[old]]]),
-        influence=True,
-        max_correlation=bound,
-    )
-    good = linalg.is_positive_definite(again.covariance) & np.isfinite(again.mean).all(axis=0)
+
+    def rule(x: Floats, P: Floats, _w: Floats | None, _c: Ints, _e: Ints) -> tuple[Floats, Floats, Floats]:
+        again = fuse_last("bci", x, P, influence=True, max_correlation=bound)
+        return again.mean, again.covariance, _influence(again)
+
+    means = np.stack([one[:, old], picture.mean[:, at[old]]])
+    covariances = np.stack([spread[:, :, old], picture.covariance[:, :, at[old]]])
+    mean, covariance, shares = fuse_known(means, covariances, None, unknown, True, rule)
+    good = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
     kept = old[good]
-    one[:, kept], spread[:, :, kept] = again.mean[:, good], again.covariance[:, :, good]
-    gains[:, kept] *= _influence(again)[0][good]
+    one[:, kept], spread[:, :, kept] = mean[:, good], covariance[:, :, good]
+    gains[:, kept] *= shares[0][good]
 
 
 def _with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]]) -> Picture:

@@ -66,7 +66,11 @@ class FusionCentre(Centre):
         return self._contributions(rows, influence)
 
     def _watched(self) -> dict[str, dict[str, Any]]:
-        return {name: self._memory.watch.health(name) for name in self._memory.watch.records}
+        watch, wanted = self._memory.watch, self.config.by_tracklets
+        return {
+            name: {key: value for key, value in watch.health(name).items() if wanted or "tracklets" not in key}
+            for name in watch.records
+        }
 
     def _forget(self, tracks: Iterable[int]) -> None:
         self._relink(dict.fromkeys(tracks, 0))

@@ -68,16 +68,17 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     tracks, linked, tests = rows.tracks, rows.linked(), settings.tests
     links = tracks.link[linked]
     fresh = rows.fresh[linked]
-    predicted = _from_prediction(rows, linked, now, time, settings)
-    jumped = fresh & (predicted > tests.keep)
+    predicted, seen = _from_prediction(rows, linked, now, time, settings)
+    jumped = fresh & (predicted > tests.keep[seen])
     outside = np.where(fresh, jumped, tracks.outside[linked])
     some = np.flatnonzero(~outside)
     agreed = consensus(links[some], tracks.mean[:, linked[some]], tracks.covariance[:, :, linked[some]])
-    distance = np.full(len(linked), np.nan)
-    distance[some] = _from_others(rows, linked[some], agreed)
-    failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep)
+    distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
+    distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
+    failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep[shared])
     outside[failed] = True
-    _weigh(rows, linked, distance, predicted, jumped, agreed.size, some, tests)
+    agreement, jump = tests.agreement(distance, shared), tests.jump(predicted, seen)
+    _weigh(rows, linked, agreement, jump, jumped, agreed.size, some, tests.bound)
     tracks.outside[linked] = outside
     tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
     tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
@@ -114,25 +115,28 @@ def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensu
     return Consensus(labels, mean, covariance, others_mean, others_covariance, size)
 
 
-def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings) -> Floats:
-    """d2 (L,) of each linked row to the prediction of its global track, a manoeuvre allowed for."""
+def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings) -> tuple[Floats, Ints]:
+    """d2 (L,) of each linked row to the prediction of its global track, a manoeuvre allowed for, and over how many
+    components that is."""
     tracks = rows.tracks
     at = now.find(tracks.link[linked])
     seconds = np.maximum(time - now.seen[at], 0) / 1e9
     spread = tracks.covariance[:, :, linked] + now.covariance[:, :, at]
     spread += manoeuvred(settings.space, settings.manoeuvre, seconds)
+    size, _ = settings.tests.unknown.common(spread)
     distance = linalg.quadratic(spread, tracks.mean[:, linked] - now.mean[:, at])
-    return np.where(now.time[at] >= 0, np.where(np.isnan(distance), np.inf, distance), 0.0)
+    return np.where(now.time[at] >= 0, np.where(np.isnan(distance), np.inf, distance), 0.0), size
 
 
-def _from_others(rows: Rows, some: Ints, agreed: Consensus) -> Floats:
-    """d2 (S,) of each row to the others of its track, NaN where it is alone."""
-    distance = np.full(len(some), np.nan)
+def _from_others(rows: Rows, some: Ints, agreed: Consensus, tests: Tests) -> tuple[Floats, Ints]:
+    """d2 (S,) of each row to the others of its track, NaN where it is alone, and over how many components."""
+    distance, size = np.full(len(some), np.nan), np.zeros(len(some), dtype=np.intp)
     several = np.flatnonzero(agreed.size > 1)
     at = some[several]
     spread = rows.tracks.covariance[:, :, at] + agreed.others_covariance[:, :, several]
     distance[several] = linalg.quadratic(spread, rows.tracks.mean[:, at] - agreed.others_mean[:, several])
-    return distance
+    size[several], _ = tests.unknown.common(spread)
+    return distance, size
 
 
 def _worst(
@@ -150,7 +154,7 @@ def _worst(
 
 
 def _weigh(
-    rows: Rows, linked: Ints, distance: Floats, predicted: Floats, jumped: Bools, size: Ints, some: Ints, tests: Tests
+    rows: Rows, linked: Ints, agreement: Floats, jump: Floats, jumped: Bools, size: Ints, some: Ints, bound: float
 ) -> None:
     """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
     tracks, fresh = rows.tracks, rows.fresh[linked]
@@ -159,10 +163,10 @@ def _weigh(
     together = np.zeros(len(linked), dtype=np.bool_)
     together[some] = size > 1
     weighed = fresh & together & ~jumped & (others > tracks.weighed[linked])
-    more = np.where(weighed, np.nan_to_num(tests.agreement(distance), nan=0.0), 0.0)
-    more = np.where(fresh & ~together & ~jumped, tests.bound / 4, more)
-    more = np.where(jumped, tests.jump(predicted), more)
-    tracks.evidence[linked] = np.clip(tracks.evidence[linked] + more, -tests.bound, tests.bound)
+    more = np.where(weighed, np.nan_to_num(agreement, nan=0.0), 0.0)
+    more = np.where(fresh & ~together & ~jumped, bound / 4, more)
+    more = np.where(jumped, jump, more)
+    tracks.evidence[linked] = np.clip(tracks.evidence[linked] + more, -bound, bound)
     tracks.weighed[linked] = np.where(weighed, others, tracks.weighed[linked])
 
 

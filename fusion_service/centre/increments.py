@@ -68,7 +68,7 @@ def increments(versions: Versions) -> Increments:
         sound = (np.minimum(first, second) > 0) & np.isfinite(vector).all(axis=0)
         sound &= np.isfinite(information).all(axis=(0, 1))
         sound &= linalg.is_positive_definite(information + NEGATIVE * old)
-        judged = np.isfinite(innovation) & np.isfinite(freedom) & (freedom > 0)
+        judged = np.isfinite(innovation) & np.isfinite(freedom) & linalg.is_positive_definite(ridged)
     return Increments(
         information, vector, np.where(judged, innovation, 0.0), np.where(judged, freedom, 0.0), sound & judged
     )

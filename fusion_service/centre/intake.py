@@ -10,7 +10,7 @@ An intensity stands in its source's table as a complete scan: a track per compon
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import groupby
 from typing import TypeAlias
 
@@ -21,7 +21,9 @@ from fusion_service.centre import notes
 from fusion_service.centre.clock import horizon
 from fusion_service.centre.declared import declared_by, loosened, motion_declared, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
+from fusion_service.centre.events import Event, Refused, SourceFound, SourceLost
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
+from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lineage import Lineages
@@ -49,7 +51,7 @@ from schemas import (
     digest,
 )
 
-__all__ = ["MAX_TOTAL", "Event", "Intake", "Refused", "SourceFound", "SourceLost"]
+__all__ = ["MAX_TOTAL", "Intake"]
 
 MAX_SOURCES = 1000
 MAX_TRACKS = 20_000
@@ -60,32 +62,6 @@ MAX_EVENTS = 10_000
 MAX_ORDERS = 1000
 """Orders of one step."""
 
-
-@dataclass(frozen=True, slots=True)
-class SourceFound:
-    """The source's liveliness token is there."""
-
-    source: str
-
-
-@dataclass(frozen=True, slots=True)
-class SourceLost:
-    """The source's liveliness token is gone: its tracks live on until they are stale."""
-
-    source: str
-
-
-@dataclass(frozen=True, slots=True)
-class Refused:
-    """Something refused, or `dropped` from a full queue, before it came here: to be counted and logged."""
-
-    source: str
-    reason: str
-    count: int = 0
-    dropped: bool = False
-
-
-Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused | ClockSet | NewEra
 _Queued: TypeAlias = tuple[Message, int]
 _Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]
 _Checked: TypeAlias = tuple[tuple[Source, LocalTracks, Entry], NDArray[np.uint8]]
@@ -330,7 +306,7 @@ class Intake:
             return "" if is_sound(message) else "bad-info"
         if last >= 0 and holds < last - round(self.config.lateness * 1e9):
             return "late"
-        if not set(self.config.space) <= set(message.space):
+        if self.config.kind == "intensity" and not set(self.config.space) <= set(message.space):
             return "space"
         if isinstance(message, LocalIntensity) is not (self.config.kind == "intensity"):
             return "intensity" if isinstance(message, LocalIntensity) else "tracks"
@@ -384,9 +360,10 @@ class Intake:
             try:
                 if self.frame is None:
                     raise FrameError(notes.unfit(name_frame(first.frame), self.config.space))
+                messages = [with_height(one, said.height, self.frame, self.config.space) for one in messages]
                 most, words = self.config.max_components, (self.said, self.lineages)
                 new = message_tracks(messages, sound, self.frame, said.height, most, *words)
-                new = loosened(new, first.space, said)
+                new = loosened(new, messages[0].space, said)
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))
             else:

@@ -30,6 +30,8 @@ NOBODY, ANYONE = 0, 1
 MOST_NAMES = 4096
 MOST_SETS = 16_384
 ROOM = 1000
+MOST_BITS = 2**24
+"""Of the sets of one message; beyond, each of its tracks counts as containing all that the message does."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,20 +71,29 @@ class Lineages:
             return np.full(count, ALONE, dtype=np.int32)
         if message.track_lineage is None or not count:
             return np.full(count, self.of(lineage), dtype=np.int32)
-        said = np.unpackbits(message.track_lineage, axis=1, count=len(lineage), bitorder="little").astype(np.bool_)
+        bits = message.track_lineage.copy()
+        if len(lineage) % 8:
+            bits[:, -1] &= 2 ** (len(lineage) % 8) - 1
+        sets, which = np.unique(bits, axis=0, return_inverse=True)
+        if len(sets) * len(lineage) > MOST_BITS:
+            return np.full(count, self.of(lineage), dtype=np.int32)
+        said = np.unpackbits(sets, axis=1, count=len(lineage), bitorder="little").astype(np.bool_)
         said[~said.any(axis=1)] = True
-        sets, which = np.unique(np.packbits(said, axis=1), axis=0, return_inverse=True)
-        rows = np.unpackbits(sets, axis=1, count=len(lineage))
-        codes = [self.of(lineage[k] for k in np.flatnonzero(row).tolist()) for row in rows]
+        places = np.array([self._bit(name) for name in lineage], dtype=np.intp)
+        whole = np.zeros((len(self.names), len(sets)), dtype=np.bool_)
+        np.logical_or.at(whole, places, said.T)
+        codes = [self._code(int.from_bytes(row.tobytes(), "little")) for row in _packed(whole)]
         return np.array(codes, dtype=np.int32)[which.reshape(-1)]
 
     def masks(self, codes: Codes) -> Masks:
         """The sets (W, M) of codes (M,)."""
-        if self._table.shape[1] != len(self._sets) or len(self._table) != self._words:
-            self._table = np.zeros((self._words, len(self._sets)), dtype=np.uint64)
-            for number, whole in enumerate(self._sets):
-                for word in range(-(-whole.bit_length() // 64)):
-                    self._table[word, number] = whole >> (64 * word) & (2**64 - 1)
+        words, had = -(-len(self.names) // 64), self._table.shape[1]
+        if words > len(self._table):
+            self._table = np.concatenate([self._table, np.zeros((words - len(self._table), had), dtype=np.uint64)])
+        if len(self._sets) > had:
+            new = b"".join(whole.to_bytes(8 * words, "little") for whole in self._sets[had:])
+            columns = np.frombuffer(new, dtype="<u8").astype(np.uint64).reshape(-1, words).T
+            self._table = np.concatenate([self._table, columns], axis=1)
         return np.ascontiguousarray(self._table[:, np.where(codes < 0, ANYONE, codes)])
 
     def codes(self, masks: Masks) -> Codes:
@@ -130,20 +141,24 @@ class Lineages:
     def compacted(self, used: Sequence[Codes]) -> Codes | None:
         """Forget the sets, and names, that no column uses, where they are many: the new code of each old one, to index
         with a column (-1, the last, stays -1); None where the table stays."""
-        if len(self._sets) < ROOM and len(self.names) < MOST_NAMES // 2:
+        if len(self._sets) < ROOM and len(self.names) < ROOM:
             return None
         mark = np.zeros(len(self._sets) + 1, dtype=np.bool_)
         mark[:2] = True
         for codes in used:
             mark[codes] = True
         mark[-1] = False
-        if 2 * int(mark.sum()) > len(self._sets) and len(self.names) < MOST_NAMES:
+        kept = np.flatnonzero(mark).astype(np.int32)
+        rows = np.ascontiguousarray(self.masks(kept).T, dtype="<u8")
+        bits = np.unpackbits(rows.view(np.uint8), axis=-1, count=None, bitorder="little")
+        there = np.flatnonzero(bits.any(axis=0))
+        if 2 * len(kept) > len(self._sets) - ROOM and 2 * len(there) > len(self.names) - ROOM:
             return None
-        kept = [(self._named(self._sets[code]), code) for code in np.flatnonzero(mark).tolist()]
         new = np.full(len(mark), ALONE, dtype=np.int32)
-        self.restore({"names": [], "sets": []})
-        for names, code in kept:
-            new[code] = self.of(names)
+        names = [self.names[k] for k in there.tolist()]
+        packed = [row.tobytes() for row in _packed(bits[:, there].T.astype(np.bool_))]
+        self.restore({"names": names[1:], "sets": packed[2:]})
+        new[kept] = np.arange(len(kept))
         return new
 
     def kept(self) -> dict[str, Any]:
@@ -158,10 +173,6 @@ class Lineages:
             self._bit(str(name))
         for packed in kept["sets"]:
             self._code(int.from_bytes(packed, "little"))
-
-    @property
-    def _words(self) -> int:
-        return -(-len(self.names) // 64)
 
     def _bit(self, name: str) -> int:
         if name not in self._bits:
@@ -179,8 +190,10 @@ class Lineages:
             self._sets.append(whole)
         return self._codes[whole]
 
-    def _named(self, whole: int) -> list[str]:
-        return [name for k, name in enumerate(self.names) if whole >> k & 1]
+
+def _packed(bits: Bools) -> NDArray[np.uint8]:
+    """Sets (names, S) as bytes (S, ceil(names/8)), the first name the lowest bit."""
+    return np.packbits(bits.T, axis=1, bitorder="little")
 
 
 def overlapping(masks: Masks, members: Ints) -> Bools:

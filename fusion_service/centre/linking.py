@@ -69,7 +69,7 @@ class Linker:
         """
         meeting.settle(step, journal)
         judged = judge(rows, now, meeting.forced_row, time, self._settings, journal)
-        near = find_candidates(rows, now, meeting, judged, self.tests.gate, self._places)
+        near = find_candidates(rows, now, meeting, judged, self.tests, self._places)
         near = _without_broken(near, rows, now, judged)
         joined = self._assign(rows, now, _vacant(near, meeting), step, journal)
         merged = self._merge(rows, now, near, step, journal)
@@ -130,7 +130,7 @@ class Linker:
         some = rows.source[near.joins.first] == name
         joins = near.joins.take(some)
         top = joins.spread.max(initial=-np.inf)
-        worth = 1.0 + 0.5 * (rows.gate[joins.first] - joins.distance) + 0.5 * (top - joins.spread)
+        worth = 1.0 + 0.5 * (joins.gate - joins.distance) + 0.5 * (top - joins.spread)
         mine = rows.source[near.rivals.first] == name
         rivals, sums = near.rivals.take(mine), sums[mine]
         believed = np.unique(rivals.first)
@@ -209,7 +209,8 @@ class Linker:
             old &= _held(rows, now, free, at) & ~meeting.with_tracks(free, at).forbidden
             spread = tracks.covariance[:, :, free] + near.covariance[:, :, at]
             distance = linalg.quadratic(spread, tracks.mean[:, free] - near.mean[:, at])
-            more = np.where(old, -np.nan_to_num(tests.sameness(distance), nan=-tests.bound / 2), 0.0)
+            size, _ = tests.unknown.common(spread)
+            more = np.where(old, -np.nan_to_num(tests.sameness(distance, size), nan=-tests.bound / 2), 0.0)
             tracks.apart[free] = np.clip(tracks.apart[free] + more, -tests.bound, tests.bound)
         new = ~old & (nearest[free] >= 0)
         tracks.shadow[free[~old]] = NO_TRACK
@@ -227,7 +228,7 @@ class Linker:
         tracks = rows.tracks
         if not len(free):
             return picture
-        groups = group(free, rows.source, near.births, rows.gate)
+        groups = group(free, rows.source, near.births)
         count = int(groups.max(initial=-1)) + 1
         size = np.bincount(groups, minlength=count)
         may = np.bincount(groups, rows.may_start[free], minlength=count) > 0
@@ -258,7 +259,8 @@ class Linker:
         masks = _masks(rows, now)
         apart = (masks[pairs.first] & masks[pairs.second]) == 0
         pairs = pairs.take(apart)
-        self.merges.add(pairs.first, pairs.second, self.tests.sameness(pairs.distance), now, self.tests.bound)
+        same = self.tests.sameness(pairs.distance, pairs.size)
+        self.merges.add(pairs.first, pairs.second, same, now, self.tests.bound)
         far = dict(zip(zip(now.id[pairs.first].tolist(), now.id[pairs.second].tolist(), strict=True),
                        pairs.distance.tolist(), strict=True))  # fmt: skip
         merged: dict[int, int] = {}

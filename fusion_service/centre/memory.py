@@ -15,19 +15,24 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size
-from fusion_service.centre.correlation import declared_correlation
+from fusion_service.centre.correlation import AUTO, declared_correlation, declared_motions, sound_rows
+from fusion_service.centre.derived import Derived, Followed
 from fusion_service.centre.fusing import fuse_all
 from fusion_service.centre.increments import Increments, increments
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
-from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.lifecycle import WAYS, Picture
 from fusion_service.centre.motions import Motions, States
 from fusion_service.centre.rows import Rows
+from fusion_service.centre.shared_noise import SharedNoise
 from fusion_service.centre.tracklets import Filters, Operations, run
 from fusion_service.centre.versions import Versions, versions_of
-from fusion_service.centre.watch import Watch
+from fusion_service.centre.watch import UNTRUE, WATCHED, Watch
+from schemas import Entry
 
 __all__ = ["Memory"]
+
+BY_TRACKLETS = WAYS.index("tracklet")
 
 
 class Memory:
@@ -39,29 +44,47 @@ class Memory:
         self.motions = Motions(intake)
         self.filters = Filters.none(len(intake.config.space))
         self.watch = Watch()
+        self.derived = Derived(len(intake.config.space))
 
     def fuse(
         self, rows: Rows, names: tuple[str, ...], before: Picture, now: Picture, step: int, time: int, journal: Journal
     ) -> tuple[Picture, Floats]:
         """The picture of the step at `time`, ns, and the influence (M,) of each row, as `fusing.fuse_all`. before:
         the picture after the last step, `now` the same predicted to `time`."""
-        known = declared_correlation(self._intake, self._config)
-        if self._config.memory != "tracklet":
+        if not self._config.follows:
+            known = declared_correlation(self._intake, self._config)
             picture, influence = fuse_all(rows, now, time, known, journal)
             return self._moving(rows, names, picture), influence
         for event in self.watch.begin(self._intake, names):
-            journal.event(event)
+            if self._config.by_tracklets:
+                journal.event(event)
+        versions = versions_of(self._intake, rows)
+        found = increments(versions)
+        followed = self._followed(rows, names, versions, time, journal)
+        known = declared_correlation(self._intake, self._config, followed)
+        if not self._config.by_tracklets:
+            picture, influence = fuse_all(rows, now, time, known, journal)
+            self._note(rows, names, versions.row, found, np.zeros(len(versions.row), dtype=np.bool_))
+            return self._moving(rows, names, picture), influence
         at = np.where(rows.inside_mask(), now.find(rows.tracks.link), -1)
         capable = self._capable(rows, names)
-        filtered = np.zeros(len(now.id) + 1, dtype=np.bool_)
-        filtered[at[capable & (at >= 0)]] = True
-        filtered[-1] = False
-        filtered[:-1] &= before.time >= 0
+        filtered = np.append(self._filtered(now, before, at, capable), False)
         picture, influence = fuse_all(rows, now, time, known, journal, filtered[at])
         ruled = np.zeros(len(now.id) + 1, dtype=np.bool_)
         ruled[at[~filtered[at]]] = True
-        picture = self._filter(rows, names, before, picture, influence, at, capable, filtered, ruled[:-1], step, time)
+        picture = self._filter(
+            rows, names, before, picture, influence, at, capable, filtered, ruled[:-1], step, time, versions, found
+        )
         return self._moving(rows, names, picture), influence
+
+    def _filtered(self, now: Picture, before: Picture, at: Ints, capable: Bools) -> Bools:
+        """Which tracks (G,) go by a filter: that two capable rows feed, or one alone where there is a filter already.
+        A filter of one row would only do again what its tracker has done."""
+        fed, count = at >= 0, len(now.id)
+        able = np.bincount(at[fed & capable], minlength=count)
+        other = np.bincount(at[fed & ~capable], minlength=count)
+        held = np.isin(now.id, self.filters.id)
+        return np.asarray(((able > 1) | (held & (able > 0) & (other == 0))) & (before.time >= 0))
 
     def _moving(self, rows: Rows, names: tuple[str, ...], picture: Picture) -> Picture:
         """The picture, its tracks moving as the sources that feed them declare."""
@@ -70,6 +93,22 @@ class Memory:
         declared = [self._intake.motion_said(source) for source in sources]
         at = picture.find(rows.tracks.link[inside])
         return replace(picture, motion=self.motions.follow(picture, at, declared, rows.source[inside]))
+
+    def _followed(
+        self, rows: Rows, names: tuple[str, ...], versions: Versions, time: int, journal: Journal
+    ) -> Followed | None:
+        """What successive covariances tell of the correlation of rows; by rule auto not of those whose own innovations
+        speak against what they say."""
+        if not self._config.by_derived:
+            return None
+        chosen = self._config.rule != AUTO
+        trusted = [chosen or self.watch.records[name].reason not in UNTRUE for name in names]
+        sound = sound_rows(rows) & np.array(trusted, dtype=np.bool_)[rows.source] & kinship.alone(self._intake, rows)
+        noise = SharedNoise(declared_motions(self._intake), self._config.space)
+        followed = self.derived.follow(rows, names, versions, noise, sound, time)
+        if self.derived.beyond:
+            journal.refuse(Entry("", 0, 0, 0, "too-many-pairs", self.derived.beyond))
+        return followed
 
     def _capable(self, rows: Rows, names: tuple[str, ...]) -> Bools:
         """Rows (M,) whose versions may be taken as tracklets."""
@@ -80,14 +119,12 @@ class Memory:
 
     def _filter(
         self, rows: Rows, names: tuple[str, ...], before: Picture, picture: Picture, influence: Floats, at: Ints,
-        capable: Bools, filtered: Bools, ruled: Bools, step: int, time: int,
+        capable: Bools, filtered: Bools, ruled: Bools, step: int, time: int, versions: Versions, found: Increments,
     ) -> Picture:  # fmt: skip
         """Run the filters of the tracks `filtered`, and write the influences of their rows."""
         tracks = rows.tracks
         self.filters.rename(names)
         base = self.filters.bases(before)
-        versions = versions_of(self._intake, rows)
-        found = increments(versions)
         settled = filtered[at] & (tracks.since < step)
         row = versions.row
         good = found.sound & (capable & settled)[row] & (versions.time >= base.time[at[row]])
@@ -115,12 +152,12 @@ class Memory:
         for ids, groups in by_size(tracks.link[fed]):
             there = picture.find(ids)
             lineage[there] = kinship.inherited(rows, fed[groups], lineage[there], memory=True)
-        way = np.where(filtered[:-1], 1, np.where(ruled, 0, picture.way)).astype(np.uint8)
+        way = np.where(filtered[:-1], BY_TRACKLETS, picture.way).astype(np.uint8)
         return replace(picture, mean=mean, covariance=covariance, time=when, lineage=lineage, way=way)
 
     def _note(self, rows: Rows, names: tuple[str, ...], row: Ints, found: Increments, taken: Bools) -> None:
         """Let the watch see the versions that count: of sources that declare what it takes, and Gaussian."""
-        watched = [self.watch.records[name].reason in ("", "innovations") for name in names]
+        watched = [self.watch.records[name].reason in WATCHED for name in names]
         mine = np.array(watched, dtype=np.bool_)[rows.source[row]]
         parts = rows.tracks.log_weight
         if len(parts):
@@ -171,16 +208,25 @@ class Memory:
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns."""
         self.filters.rebase(time)
+        self.derived = Derived(len(self._config.space))
 
     def packed(self) -> dict[str, Any]:
-        """As plain values."""
-        return {"motions": self.motions.packed(), "watch": self.watch.packed(), "filters": self.filters.packed()}
+        """As plain values. What is in the picture's frame says which."""
+        packed = {
+            "frame": repr(self._intake.frame), "motions": self.motions.packed(), "watch": self.watch.packed(),
+            "filters": self.filters.packed(),
+        }  # fmt: skip
+        return packed | ({"derived": self.derived.packed()} if len(self.derived) else {})
 
     def restore(self, packed: dict[str, Any]) -> None:
-        """From what `packed` gave; without the filters where the state space is another."""
+        """From what `packed` gave; without what is in another frame or space."""
         self.motions.restore(packed["motions"])
         self.watch.restore(packed["watch"])
+        if packed["frame"] != repr(self._intake.frame):
+            return
         self.filters = Filters.unpacked(packed["filters"], len(self._config.space))
+        if "derived" in packed and self._config.by_derived:
+            self.derived.restore(packed["derived"])
 
 
 def _whole(rows: Rows, some: Ints, time: int) -> Operations:

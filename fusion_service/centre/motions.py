@@ -78,17 +78,21 @@ class Motions:
     def predicted(self, picture: Picture, time: int) -> Picture:
         """The picture at `time`, ns; tracks without a density as they are."""
         dt = np.where(picture.time >= 0, time - picture.time, 0) / 1e9
-        return self.moved(picture, picture.motion, dt)
+        return self.moved(picture, picture.motion, dt, np.maximum(picture.time - picture.seen, 0) / 1e9)
 
-    def moved(self, tracks: Kind, codes: Codes, dt: NDArray[np.float64]) -> Kind:
-        """Densities, in the centre's space, with these motions `dt` seconds later, each (T,)."""
+    def moved(self, tracks: Kind, codes: Codes, dt: Floats, age: Floats | None = None) -> Kind:
+        """Densities, in the centre's space, with these motions `dt` seconds later, each (T,). age (T,): seconds for
+        which nothing was heard of them already."""
+        age, speed = np.zeros(len(dt)) if age is None else age, self._config.unknown_speed
         space, frame = self._config.space, self._intake.frame
         kinds = np.unique(codes)
         if len(kinds) <= 1:
-            return predict_tracks(tracks, self.motion(int(kinds[0]) if len(kinds) else -1), space, space, dt, frame)
+            return predict_tracks(
+                tracks, self.motion(int(kinds[0]) if len(kinds) else -1), space, space, dt, frame, speed, age
+            )
         parts = [np.flatnonzero(codes == kind) for kind in kinds]
         moved = [
-            predict_tracks(tracks.take(at), self.motion(int(kind)), space, space, dt[at], frame)
+            predict_tracks(tracks.take(at), self.motion(int(kind)), space, space, dt[at], frame, speed, age[at])
             for kind, at in zip(kinds, parts, strict=True)
         ]
         return join_tracks(moved).take(np.argsort(np.concatenate(parts), kind="stable"))

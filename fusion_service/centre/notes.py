@@ -3,9 +3,29 @@
 from __future__ import annotations
 
 from fusion_service.config import CentreConfig
+from fusion_service.rules import RULES
+from fusion_service.ways import reason_words
 from schemas import Message
 
-__all__ = ["ahead", "frame_refused", "frame_waiting", "refusal", "stale", "unfit", "waiting"]
+__all__ = [
+    "ahead",
+    "frame_refused",
+    "frame_waiting",
+    "no_tracklets",
+    "partial",
+    "refusal",
+    "stale",
+    "unfit",
+    "waiting",
+]
+
+MENDS = {
+    "motion": "let it declare its motion, or set motion for it under [centre.sources]",
+    "space": "set space under [centre] to hold its components, and let it send velocities or declare ou or still",
+    "innovations": "let its covariances and the motion it declares be those of its tracker and its targets",
+    "increments": "a tracker of several models, or one whose covariances are edited, gives none",
+}
+"""What to do, or what is behind it."""
 
 
 def refusal(reason: str, message: Message, last: int, received: int, config: CentreConfig) -> str:
@@ -55,3 +75,19 @@ def frame_refused(why: str) -> str:
 def unfit(spoken: str, space: tuple[str, ...]) -> str:
     """What it speaks in cannot be the frame of the picture."""
     return f"{spoken} cannot be the frame of a picture in {' '.join(space)}"
+
+
+def partial(space: tuple[str, ...], config: CentreConfig) -> str:
+    """Its tracks lack components of the picture, and the rule is not in information form; else empty."""
+    missing = [name for name in config.space if name not in space]
+    if not missing or config.kind == "intensity" or config.rule not in RULES or RULES[config.rule].information:
+        return ""
+    return (
+        f"its tracks have no {' '.join(missing)}: {config.rule} fuses what all sources of a track have, "
+        f"and these follow from the sources that tell them"
+    )
+
+
+def no_tracklets(why: str) -> str:
+    """Its tracks go by the rule, not as tracklets, for the reason `why`."""
+    return f"no tracklets of it: {reason_words(why)}" + (f": {MENDS[why]}" if why in MENDS else "")

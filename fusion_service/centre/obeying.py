@@ -13,6 +13,7 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.judging import View, find_local, judge, linked_to
 from fusion_service.centre.lifecycle import Picture, newborn
+from fusion_service.centre.partial import Unknown, brought
 from fusion_service.centre.rows import NO_TRACK
 from fusion_service.centre.sources import relinked
 from fusion_service.order import LocalId, Order, order_event
@@ -150,12 +151,15 @@ class _Hands:
         local, at = find_local(view, order.local)
         source = self.intake.sources[local.source]
         old = int(source.tracks.link[at])
-        wanted = [source.space.index(component) for component in space]
+        one = slice(at, at + 1)
+        mean, covariance = brought(
+            source.tracks.mean[:, one], source.tracks.covariance[..., one], source.space, Unknown.of(space)
+        )
         new = self._ids.allot(1)
         born = replace(
             newborn(new, len(space), self.time),
-            mean=source.tracks.mean[wanted, at : at + 1],
-            covariance=source.tracks.covariance[np.ix_(wanted, wanted)][..., at : at + 1],
+            mean=mean,
+            covariance=covariance,
             time=source.tracks.time[at : at + 1],
             updated=source.tracks.updated[at : at + 1],
             seen=source.tracks.time[at : at + 1],

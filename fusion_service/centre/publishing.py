@@ -12,6 +12,7 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import WAYS, Picture, Support, advance
+from fusion_service.centre.partial import Unknown
 from fusion_service.centre.pictures import is_picture_of
 from fusion_service.config import CentreConfig
 from fusion_service.coverage import region_holds
@@ -83,7 +84,7 @@ def picture_message(
         ids=picture.id,
         status=picture.status,
         existence=picture.existence,
-        **_densities(picture, config.publish),
+        **_densities(picture, config.space, config.publish),
         updated=picture.updated,
         sources=names,
         contributor_counts=contributions.counts.astype(np.uint16),
@@ -135,16 +136,18 @@ def _ways(picture: Picture, rule: str) -> dict[str, Any]:
     return {"rules": tuple(WAYS[way] or rule for way in used.tolist()), "track_rule": which.astype(np.uint8)}
 
 
-def _densities(picture: Picture, publish: str) -> dict[str, Any]:
+def _densities(picture: Picture, space: tuple[str, ...], publish: str) -> dict[str, Any]:
     """The columns of a message: mixtures as they are, as their moments, or by their heaviest component."""
-    mean, covariance = picture.mean, picture.covariance
+    unknown = Unknown.of(space)
+    mean, covariance = picture.mean, unknown.told(picture.covariance)
     if len(picture.log_weight) and publish == "mixture":
-        parts = Mixtures(picture.log_weight, picture.part_mean, picture.part_covariance)
+        parts = Mixtures(picture.log_weight, picture.part_mean, unknown.told(picture.part_covariance))
         weights, means, covariances, counts = parts.rows()
         return {"means": means, "covariances": covariances, "weights": weights, "counts": counts}
     if len(picture.log_weight) and publish == "mode":
         heaviest, each = picture.log_weight.argmax(axis=0), np.arange(len(picture.id))
-        mean, covariance = picture.part_mean[:, heaviest, each], picture.part_covariance[:, :, heaviest, each]
+        mean = picture.part_mean[:, heaviest, each]
+        covariance = unknown.told(picture.part_covariance[:, :, heaviest, each])
     return {
         "means": np.ascontiguousarray(mean.T),
         "covariances": np.ascontiguousarray(np.moveaxis(covariance, 2, 0)),

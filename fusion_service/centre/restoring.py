@@ -1,7 +1,7 @@
 """What a checkpoint holds, brought into the space and frame that the config states: the config wins.
 
-Tracks are moved with mean and covariance. Of the components that only the new space has, nothing is known: they get
-mean 0 and a sigma from `UNKNOWN`, and a global track keeps its id. What cannot be moved is left out: local tracks come
+Tracks are moved with mean and covariance. Of the components that only the new space has, nothing is known: they are
+padded (see `partial`), and a global track keeps its id. What cannot be moved is left out: local tracks come
 again with their next report, the ids of global tracks are not used again.
 """
 
@@ -15,27 +15,14 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.partial import Unknown, brought, transformed
 from fusion_service.centre.rows import NO_TRACK
 from fusion_service.centre.sources import Columns, Source, empty_tracks
 from fusion_service.config import CentreConfig
-from fusion_service.geodesy import FrameError, transform
+from fusion_service.geodesy import FrameError
 from schemas import Frame, Height
 
 __all__ = ["fit_config"]
-
-UNKNOWN = {
-    "x": 1e5,
-    "y": 1e5,
-    "z": 1e4,
-    "vx": 1e3,
-    "vy": 1e3,
-    "vz": 1e2,
-    "ax": 1e2,
-    "ay": 1e2,
-    "az": 1e2,
-    "turn_rate": 1.0,
-}
-"""Sigma of a component of which nothing is known, m, m/s, m/s2, rad/s."""
 
 
 def fit_config(
@@ -43,7 +30,7 @@ def fit_config(
 ) -> Picture:
     """Change the tables of `sources` to the config, and return the picture, that was in `space` and `frame`, so."""
     for name, source in sources.items():
-        if not set(config.space) <= set(source.space):
+        if config.kind == "intensity" and not set(config.space) <= set(source.space):
             source.space, source.tracks = config.space, empty_tracks(len(config.space))
         source.tracks = _moved(source.tracks, source.space, frame, config.frame, config.source(name).height)
     picture = _moved(picture, space, frame, config.frame, config.source_defaults.height)
@@ -79,9 +66,11 @@ def _transformed(
     height: Height,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     batch = mean.shape[1:]
-    means, covariances = transform(
-        linalg.to_first(mean, batch, 1), linalg.to_first(covariance, batch, 2), space, frame, wanted, height
-    )
+    n, flat = len(mean), (int(np.prod(batch)),)
+    means, covariances = transformed(
+        linalg.to_first(mean.reshape(n, -1), flat, 1), linalg.to_first(covariance.reshape(n, n, -1), flat, 2),
+        space, frame, wanted, height,
+    )  # fmt: skip
     return (
         linalg.to_last(means, 1).reshape(mean.shape),
         linalg.symmetrise(linalg.to_last(covariances, 2)).reshape(covariance.shape),
@@ -94,27 +83,7 @@ def _taken(tracks: Columns, rows: NDArray[np.bool_]) -> Columns:
 
 def _in_space(picture: Picture, space: tuple[str, ...], wanted: tuple[str, ...]) -> Picture:
     """Marginalised to the components that both have; the rest unknown."""
-    old = np.array([space.index(name) for name in wanted if name in space], dtype=np.intp)
-    new = np.array([k for k, name in enumerate(wanted) if name in space], dtype=np.intp)
-    n = len(wanted)
-    sigma = np.array([0.0 if name in space else UNKNOWN[name] for name in wanted])
-    spread = np.diag(sigma**2)
-
-    def mean_of(mean: NDArray[np.float64]) -> NDArray[np.float64]:
-        out = np.zeros((n, *mean.shape[1:]))
-        out[new] = mean[old]
-        return out
-
-    def covariance_of(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
-        batch = covariance.shape[2:]
-        out = np.broadcast_to(spread.reshape(n, n, *(1 for _ in batch)), (n, n, *batch)).copy()
-        out[np.ix_(new, new)] = covariance[np.ix_(old, old)]
-        return out
-
-    return replace(
-        picture,
-        mean=mean_of(picture.mean),
-        covariance=covariance_of(picture.covariance),
-        part_mean=mean_of(picture.part_mean),
-        part_covariance=covariance_of(picture.part_covariance),
-    )
+    unknown = Unknown.of(wanted)
+    mean, covariance = brought(picture.mean, picture.covariance, space, unknown)
+    part_mean, part_covariance = brought(picture.part_mean, picture.part_covariance, space, unknown)
+    return replace(picture, mean=mean, covariance=covariance, part_mean=part_mean, part_covariance=part_covariance)

@@ -21,10 +21,11 @@ class Rows:
     """M usable local tracks in canonical order (source, epoch, id).
 
     source (M,): index into the sorted names. epoch (M,) u64. tracks: their columns, mean (n, M) and covariance
-    (n, n, M) predicted and marginalised to the centre's space; the columns of links may be written. may_start
-    (M,). interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. gate
-    (M,): d2 within which it may join or begin a track. fresh (M,): a measurement is in it that was not judged before.
-    kept: how many of them each source has, in order. kin: whose data is in each, None where that is not known.
+    (n, n, M) predicted and brought to the centre's space; the columns of links may be written. may_start (M,).
+    interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. gate (n + 1,
+    M): d2 within which it may join or begin a track, by how many components are in common. fresh (M,): a measurement
+    is in it that was not judged before. kept: how many of them each source has, in order. kin: whose data is in each,
+    None where that is not known.
     """
 
     source: NDArray[np.intp]

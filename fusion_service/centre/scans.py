@@ -9,9 +9,10 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service import geodesy, linalg
+from fusion_service import linalg
 from fusion_service.arrays import Floats
 from fusion_service.centre.lineage import Lineages
+from fusion_service.centre.partial import transformed
 from fusion_service.centre.sources import Tracks, no_parts, unlinked
 from fusion_service.centre.words import Lexicon
 from fusion_service.densities import Mixtures, reduce_mixtures
@@ -108,7 +109,7 @@ def message_tracks(
     means, covariances, weights, sizes = (
         np.concatenate(column) for column in zip(*map(_components, messages, sound), strict=True)
     )
-    means, covariances = geodesy.transform(means, covariances, first.space, first.frame, frame, first.height or height)
+    means, covariances = transformed(means, covariances, first.space, first.frame, frame, first.height or height)
     if sizes.max(initial=1) == 1:
         mean, covariance = linalg.to_last(means, 1), linalg.symmetrise(linalg.to_last(covariances, 2))
         parts = no_parts(len(mean), len(sizes))

@@ -356,6 +356,8 @@ class Source:
             self.scans += end >= self.complete
             self.complete = max(self.complete, end)
         self.arrived.append(new.id)
+        if space != self.space:
+            self.pairs = []
         if pair is not None:
             self.pairs.append(pair)
         for message in messages:

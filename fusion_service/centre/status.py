@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fusion_service.centre import notes
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.sources import Source
@@ -19,10 +20,10 @@ def step_status(
     log: StepLog,
     tracks: dict[str, int],
     refused: dict[str, int],
-    notes: tuple[str, ...] | None = None,
+    told: tuple[str, ...] | None = None,
     more: Mapping[str, dict[str, Any]] | None = None,
 ) -> Status:
-    """Status after the step of `log`; tracks: how many there are of each kind; notes: what an operator should know;
+    """Status after the step of `log`; tracks: how many there are of each kind; told: what an operator should know;
     more: what else there is to say of a source, by its name."""
     return Status(
         source=log.source,
@@ -37,13 +38,19 @@ def step_status(
         refused=refused,
         dropped=dict(sorted(journal.dropped.items())),
         sources={
-            name: _health(source, intake, journal, log.time) | dict((more or {}).get(name, {}))
+            name: _told(_health(source, intake, journal, log.time) | dict((more or {}).get(name, {})))
             for name, source in sorted(intake.sources.items())
         },
         tracks=tracks,
         step_time={},
-        notes=notes,
+        notes=told,
     )
+
+
+def _told(entry: dict[str, Any]) -> dict[str, Any]:
+    """An entry whose note says also why there are no tracklets, where there is nothing that matters more."""
+    why = entry.get("no_tracklets", "")
+    return entry | {"note": entry["note"] or notes.no_tracklets(why)} if why else entry
 
 
 def _health(source: Source, intake: Intake, journal: Journal, time: int) -> dict[str, Any]:
@@ -60,6 +67,6 @@ def _health(source: Source, intake: Intake, journal: Journal, time: int) -> dict
         "reordered": source.reordered,
         "tracks": len(source.tracks.id),
         "unused": dict(sorted(source.unused.items())),
-        "note": source.why,
+        "note": source.why or notes.partial(source.space, intake.config),
         "refused": dict(sorted(journal.refused_of.get(source.name, {}).items())),
     }

@@ -79,7 +79,8 @@ def _versions(
     known = ids[at] == new.id
     old, new, at = _as_said(old.take(known), inflation), _as_said(new.take(known), inflation), at[known]
     wanted = intake.config.space
-    predicted = predict_tracks(old, motion, space, wanted, (new.time - old.time) / 1e9, intake.frame)
+    gone, speed = (new.time - old.time) / 1e9, intake.config.unknown_speed
+    predicted = predict_tracks(old, motion, space, wanted, gone, intake.frame, speed)
     now = predict_tracks(new, motion, space, wanted, np.zeros(len(new.time)), intake.frame)
     return Versions(at + start, new.time, old.time, predicted.mean, predicted.covariance, now.mean, now.covariance)
 

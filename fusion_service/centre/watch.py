@@ -18,13 +18,22 @@ import numpy as np
 from fusion_service.arrays import Bools, Ints
 from fusion_service.centre.increments import Increments
 from fusion_service.centre.intake import Intake
+from fusion_service.centre.partial import AXES, PLACED
 from fusion_service.centre.sources import Source
 from fusion_service.centre.stated_registration import shift_of
+from schemas import Motion
 
-__all__ = ["Record", "Watch", "reason_of"]
+__all__ = ["INNOVATIONS", "UNTRUE", "WATCHED", "Record", "Watch", "reason_of"]
 
+INNOVATIONS = "innovations"
+WATCHED = ("", INNOVATIONS, "increments", "registration", "covariance_floor")
+"""Reasons, of those whose increments are what the tracker has measured all the same."""
+UNTRUE = (INNOVATIONS, "feedback", "motion")
+"""Reasons for which nothing is to be concluded from successive covariances either."""
 REMEMBERED = 2000.0
 """Degrees of freedom that a sum holds about; older ones fade."""
+FEW = 20
+"""Versions before their soundness is judged."""
 SIGMAS = 3.3
 """Of a sum's own spread, beyond which it is not by chance (1 in 1,000, two-sided)."""
 MATTERS = 0.15
@@ -35,12 +44,13 @@ LEAST = 0.75
 
 @dataclass(slots=True)
 class Record:
-    """Of one source, fading: sum and freedom of its innovations, versions and how many of them were tracklets.
-    reason: why its tracks are not taken as tracklets, or ""."""
+    """Of one source, fading: sum and freedom of its innovations, versions, and how many of them were sound and how many
+    taken as tracklets. reason: why its tracks are not taken as tracklets, or ""."""
 
     sum: float = 0.0
     freedom: float = 0.0
     versions: float = 0.0
+    sound: float = 0.0
     taken: float = 0.0
     reason: str = ""
 
@@ -66,12 +76,18 @@ class Record:
         low, high = self.bounds
         return self.ratio > max(high, WORST) or self.ratio < min(low, LEAST)
 
-    def add(self, innovation: float, freedom: float, versions: int, taken: int) -> None:
+    @property
+    def unsound(self) -> bool:
+        """Whether most of its increments are no measurements."""
+        return self.versions >= FEW and self.sound < 0.5 * self.versions
+
+    def add(self, innovation: float, freedom: float, versions: int, sound: int, taken: int) -> None:
         """Count one step."""
         kept = min(1.0, REMEMBERED / (self.freedom + freedom)) if freedom > 0 else 1.0
         self.sum, self.freedom = kept * (self.sum + innovation), kept * (self.freedom + freedom)
         kept = min(1.0, REMEMBERED / (self.versions + versions)) if versions > 0 else 1.0
         self.versions, self.taken = kept * (self.versions + versions), kept * (self.taken + taken)
+        self.sound = kept * (self.sound + sound)
 
 
 class Watch:
@@ -86,8 +102,10 @@ class Watch:
         changed = []
         for name, record in self.records.items():
             reason = reason_of(intake, intake.sources[name])
-            if not reason and record.fails:
-                reason = "innovations"
+            if reason in WATCHED and record.fails:
+                reason = INNOVATIONS
+            elif not reason and record.unsound:
+                reason = "increments"
             if reason != record.reason and (reason or record.versions):
                 changed.append({"kind": "tracklets", "source": name, "why": reason, "ratio": round(record.ratio, 4)})
             record.reason = reason
@@ -98,7 +116,8 @@ class Watch:
         for at in np.unique(source).tolist():
             mine = source == at
             innovation, freedom = (math.fsum(part[mine].tolist()) for part in (found.innovation, found.freedom))
-            self.records[names[at]].add(innovation, freedom, int(mine.sum()), int(taken[mine].sum()))
+            counts = (int(part[mine].sum()) for part in (mine, found.sound, taken))
+            self.records[names[at]].add(innovation, freedom, *counts)
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
@@ -114,7 +133,7 @@ class Watch:
     def packed(self) -> dict[str, list[Any]]:
         """As plain values."""
         return {
-            name: [one.sum, one.freedom, one.versions, one.taken, one.reason]
+            name: [one.sum, one.freedom, one.versions, one.sound, one.taken, one.reason]
             for name, one in sorted(self.records.items())
         }
 
@@ -134,6 +153,13 @@ def reason_of(intake: Intake, source: Source) -> str:
         return "covariance_floor"
     if shift_of(intake, source) is not None:
         return "registration"
-    if not set(source.space) <= set(intake.config.space):
+    if not set(source.space) <= set(intake.config.space) or _goes_unseen(source, intake.config.space, said.motion):
         return "space"
     return ""
+
+
+def _goes_unseen(source: Source, space: tuple[str, ...], motion: Motion) -> bool:
+    """Whether it tells places whose velocity it does not know: how these move is no tracker's prediction."""
+    there = source.space
+    unseen = any(place in there and speed in space and speed not in there for place, speed in AXES)
+    return unseen and motion.kind not in PLACED

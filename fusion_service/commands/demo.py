@@ -13,8 +13,9 @@ __all__ = ["EXAMPLE", "HELP", "add", "run"]
 HELP = "A whole mission: hub, service, clients and recorder as processes, then a table, a map and a recording."
 EXAMPLE = """fusion-service demo
   fusion-service demo --rule hmd-ga --json result.json
+  fusion-service demo --memory tracklet
   fusion-service demo --scenario autoferry:2 --data DIR --speed 10
-  fusion-service demo --scenario mrclam:6 --data DIR --speed 30
+  fusion-service demo --scenario mrclam:6 --data DIR
   fusion-service demo --rule bci --set rule_options.max_correlation=0.5 --set gate=0.99"""
 
 
@@ -26,14 +27,21 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of the recordings, or that holds autoferry/, mrclam/ (default: $FUSION_DATA)",
     )
-    parser.add_argument("--rule", default="ci", help="fusion rule (default ci; `fusion-service rules` lists them)")
+    parser.add_argument(
+        "--rule", default="auto", help="fusion rule (default auto; `fusion-service rules` lists them)"
+    )
     parser.add_argument("--criterion", help="of the rule's weights: det or trace")
-    parser.add_argument("--memory", default="restart", choices=("restart", "recursive"), help="default restart")
+    parser.add_argument(
+        "--memory",
+        default="auto",
+        choices=("auto", "restart", "recursive", "tracklet"),
+        help="what is fused beside the newest local tracks (default auto: tracklets with rule auto, else nothing)",
+    )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre, above all others"
     )
     parser.add_argument(
-        "--speed", type=argument(positive), default=None, help="times faster than real time (default 10)"
+        "--speed", type=argument(positive), default=None, help="times faster than real time (default 10, mrclam 5)"
     )
     parser.add_argument("--seed", type=argument(whole), default=1, help="of the simulated sensors (default 1)")
     parser.add_argument(

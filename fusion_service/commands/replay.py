@@ -12,6 +12,7 @@ __all__ = ["EXAMPLE", "HELP", "add", "run"]
 HELP = "Fuse a recorded mission again: as it was, or under other rules and settings, side by side."
 EXAMPLE = """fusion-service replay mission.rrd --verify
   fusion-service replay mission.rrd --rule ci --rule hmd-ga:criterion=trace --rule naive --out rules.rrd
+  fusion-service replay mission.rrd --set memory=tracklet --out tracklets.rrd
   fusion-service replay mission.rrd --set gate=0.99 --set rule_options.criterion=trace --out gate.rrd
   fusion-service replay tracks-only.rrd --config centre.toml --out fused.rrd"""
 

@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
-from fusion_service.config.correlation import rule_options
+from fusion_service.config.correlation import is_derived, rule_options
 from fusion_service.config.readers import (
     DURATION,
     POSITIVE,
@@ -117,7 +117,7 @@ class CentreConfig:
     delay: float = _setting(0.5, DURATION, "wall clock: how far behind now a step is")
     lateness: float = _setting(5.0, DURATION, "how late a message may be, seconds")
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
-    rule: str = _setting("ci", read_rule, "fusion rule (fusion-service rules lists them)")
+    rule: str = _setting("auto", read_rule, "fusion rule (fusion-service rules lists them)")
     rule_options: dict[str, Any] = _setting({}, rule_options, "options of the rule, e.g. {criterion = 'trace'}")
     mixture_rule: str = _setting("moments", read_mixture_rule, "rule for mixtures; moments: as Gaussians, by the rule")
     mixture_options: dict[str, Any] = _setting({}, table, "options of the mixture rule")
@@ -130,9 +130,10 @@ class CentreConfig:
         None, maybe(read_coverage), "only tracks in it go out; about the origin of the picture's frame; left out: all"
     )
     memory: str = _setting(
-        "restart",
-        choice("restart", "recursive", "tracklet"),
-        "fuse local tracks only, the last result too, or what successive versions of them have added",
+        "auto",
+        choice("auto", "restart", "recursive", "tracklet"),
+        "fuse local tracks only, the last result too, or what their successive versions add; auto: tracklet with rule "
+        "auto, else restart",
     )
     memory_correlation: float = _setting(
         1.0, number(0, 1), "bound on the correlation of the last result and new tracks"
@@ -147,6 +148,9 @@ class CentreConfig:
         1e-3, number(1e-9, 0.2), "rate of wrong decisions about links, exchanges, merges and splits"
     )
     manoeuvre: float = _setting(20.0, number(0, 1e4), "acceleration that targets may show unannounced, m/s2 (1 sigma)")
+    unknown_speed: float = _setting(
+        100.0, number(0, 1e5), "speed that targets may have of which nobody tells the velocity, m/s (1 sigma)"
+    )
     confirm_hits: int = _setting(2, whole(1, 64), "reports with a new measurement that confirm a track ...")
     confirm_within: int = _setting(4, whole(1, 64), "... of so many that were due")
     min_sources: int = _setting(1, whole(1, 255), "sources that a track needs to be confirmed")
@@ -190,7 +194,17 @@ class CentreConfig:
     @property
     def follows(self) -> bool:
         """Whether successive versions of local tracks are used, not only the newest."""
-        return self.memory == "tracklet"
+        return self.kind == "tracks" and (self.by_tracklets or self.by_derived)
+
+    @property
+    def by_tracklets(self) -> bool:
+        """Whether filters of the targets' own take tracklets, where they are sound."""
+        return self.memory == "tracklet" or (self.memory == "auto" and self.rule == "auto")
+
+    @property
+    def by_derived(self) -> bool:
+        """Whether cross-covariances of local tracks are derived."""
+        return self.rule == "auto" or is_derived(self.rule, self.rule_options)
 
     def source(self, name: str) -> SourceConfig:
         """The settings of one source: its own, or the defaults."""

@@ -19,6 +19,8 @@ __all__ = ["DERIVED", "GroupBounds", "group_bounds", "is_derived", "rule_options
 
 DERIVED = "derived"
 BOUND = number(0.0, 1.0)
+AUTO_OPTIONS = ("criterion", "max_correlation", "scales")
+"""Of rule auto, which hands them on to `ci` and `bci`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +106,13 @@ def tried(rule: str, options: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
         if options.get("cross") != DERIVED:
             raise ValueError(f'{rule} needs rule_options = {{cross = "{DERIVED}"}}, not {options.get("cross")!r}')
         return "bci", {}
+    if rule == "auto":
+        for key in options:
+            if key not in AUTO_OPTIONS:
+                raise ValueError(f"auto has no option {key!r} (known: {', '.join(AUTO_OPTIONS)})")
+        if "max_correlation" in options and group_bounds(options) is None:
+            raise ValueError("auto takes max_correlation as a table of bounds between groups")
+        return "bci", {key: value for key, value in options.items() if key != "max_correlation"}
     few = dict(options)
     if rule == "bci" and (few.get("max_correlation") == DERIVED or group_bounds(options) is not None):
         few["max_correlation"] = 1.0

@@ -164,7 +164,7 @@ def _rule_problems(config: CentreConfig) -> list[str]:
         try:
             fused = fuse_last(rule, mean, covariance, influence=True, **few)
         except (RuleError, TypeError, ValueError, OverflowError) as error:
-            return [f"{rule} cannot fuse {count} source{'s' * (count > 1)} here: {error}"]
+            return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} here: {error}"]
         if not np.isfinite(fused.covariance).all():
-            return [f"{rule} cannot fuse {count} source{'s' * (count > 1)} of unit covariance here"]
+            return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} of unit covariance here"]
     return []

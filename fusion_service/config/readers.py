@@ -77,10 +77,10 @@ def choice(*known: str) -> Callable[[Any], str]:
 
 
 def read_rule(value: Any) -> str:
-    """The name of a fusion rule."""
+    """The name of a fusion rule, or auto."""
     from fusion_service.rules import RULES
 
-    return choice(*RULES)(value)
+    return choice(*RULES, "auto")(value)
 
 
 def read_mixture_rule(value: Any) -> str:

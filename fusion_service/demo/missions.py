@@ -17,7 +17,6 @@ JITTER = 1.5
 THREE_RADARS = """\
 period = 10.0
 frame = {kind = "enu", lat = 59.7138694, lon = -55.2676093}   # collocated with radar 1 (Sharma 6.4)
-motion = {kind = "cv", q = 10.0}
 coast = 25.0
 """
 """Settings of the centre for the simulated radars, as TOML."""
@@ -25,7 +24,6 @@ coast = 25.0
 AUTOFERRY = """\
 period = 1.0
 frame = {kind = "enu", lat = 63.4389029083, lon = 10.39908278, alt = 39.923}   # Piren
-motion = {kind = "cv", q = 0.1}
 coast = 3.0
 """
 """Settings of the centre for the recorded lidar and radar, as TOML."""
@@ -94,7 +92,7 @@ def plan_mission(
     if kind == "mrclam":
         robots = (f"robot{n}{suffix}" for suffix in ("", "-self") for n in range(1, 6))
         return MissionPlan(
-            scenario, {name: [*command, name] for name in (*robots, "truth")}, MRCLAM, 756.0, 10.0, 1.0, 1.0, 3.0
+            scenario, {name: [*command, name] for name in (*robots, "truth")}, MRCLAM, 756.0, 5.0, 1.0, 1.0, 3.0
         )
     clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
     return MissionPlan(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)

@@ -106,6 +106,7 @@ RULE = Rule(
     promise="optimal (linear) for the cross-covariances given",
     source="Bar-Shalom and Campo 1986, N-way by maximum likelihood (Kim 1994)",
     fuse=bar_shalom_campo,
+    information=True,
     takes={"cross_covariance": Option(None, _cross, per_element=3)},
     takes_weights=False,
     refusal="is too ill-conditioned to fuse, or its joint covariance is not positive definite",

@@ -87,6 +87,7 @@ RULE = Rule(
     promise="conservative for every correlation within the bound; tight for two sources",
     source="bounded covariance inflation (Reece and Roberts 2005), N-way",
     fuse=in_scales(bci),
+    information=True,
     takes={"criterion": CRITERION, "scales": SCALES, "max_correlation": Option(1.0, _bound, per_element=2)},
 )
 

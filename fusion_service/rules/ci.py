@@ -39,6 +39,7 @@ RULE = Rule(
     promise="conservative for every correlation",
     source="covariance intersection (Julier and Uhlmann 1997; Sharma (4); Li-AA (16)-(18))",
     fuse=in_scales(ci),
+    information=True,
     takes={"criterion": CRITERION, "scales": SCALES},
 )
 

@@ -23,5 +23,6 @@ RULE = Rule(
     promise="conservative for every correlation",
     source="CI, weights in closed form: Franken and Huepper 2005 (det), Niehsen 2002 (trace)",
     fuse=in_scales(fast_ci),
+    information=True,
     takes={"criterion": CRITERION, "scales": SCALES},
 )

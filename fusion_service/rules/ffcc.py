@@ -28,6 +28,7 @@ RULE = Rule(
     promise="conservative for every correlation, also of sources that understate their covariance by delta",
     source="CI, weights in closed form that sum to delta (Wang and Li 2009; Li-AA after (18))",
     fuse=in_scales(ffcc),
+    information=True,
     takes={
         "criterion": CRITERION,
         "scales": SCALES,

@@ -25,5 +25,6 @@ RULE = Rule(
     promise="right only for independent tracks",
     source="product of the densities",
     fuse=naive,
+    information=True,
     takes_weights=False,
 )

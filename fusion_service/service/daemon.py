@@ -31,14 +31,17 @@ from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, open_state
-from fusion_service.service.status import StatusMaker
+from fusion_service.service.status import StatusMaker, status_line
 from fusion_service.service.stepping import LastingCentre
 from fusion_service.service.tokens import Tokens
+from fusion_service.ways import no_tracklets
 from schemas import (
     GlobalTracks,
     LocalIntensity,
     LocalTracks,
     MessageError,
+    Status,
+    StepLog,
     centre_source,
     decode,
     encode,
@@ -92,7 +95,7 @@ class Service:
         notify("READY=1")
         centre = self._config.centre
         rule = centre.rule if centre.kind == "tracks" else f"{centre.intensity_rule} of intensities"
-        log.info("fusing by %s every %g s as %s", rule, centre.period, centre.name)
+        log.info("fusing by %s, memory %s, every %g s as %s", rule, centre.memory, centre.period, centre.name)
         status_due = time.monotonic() + self._config.service.status_period
         while not stop.is_set():
             timeout = max(0.0, status_due - time.monotonic())
@@ -107,8 +110,7 @@ class Service:
             self._step_all(stop)
             if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
-                self._publish_status()
-                notify("WATCHDOG=1")
+                notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
         notify("STOPPING=1")
         self._publish_status()
         log.info("stopped after %d steps", self._counts["steps"])
@@ -222,6 +224,7 @@ class Service:
         notes = made.result.status.notes
         if notes and self._told.allows(notes[0], 600.0):
             log.warning("%s", "; ".join(notes))
+        self._tell_tracklets(made.result.log)
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._picture = made.messages["tracks"]
@@ -229,7 +232,19 @@ class Service:
             self._out[what].put(payload)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
 
-    def _publish_status(self) -> None:
+    def _tell_tracklets(self, journal: StepLog) -> None:
+        """Say whose tracks are no tracklets any more, and why, or are again: twenty lines a second at most."""
+        for event in journal.events:
+            if event.get("kind") != "tracklets":
+                continue
+            if self._told.allows(f"tracklets {self._counts['tracklets'] % 20}", 1.0):
+                level = logging.WARNING if event.get("why") else logging.INFO
+                log.log(level, "source %s: %s", event.get("source"), no_tracklets(event))
+                self._counts["tracklets"] += 1
+            elif self._told.allows("many tracklets", 1.0):
+                log.warning("tracks of many sources are tracklets no more, or again: the status has them all")
+
+    def _publish_status(self) -> Status:
         last = self._result.status if self._result is not None else None
         centre = self._lasting.centre
         refused = centre.refusals()
@@ -243,3 +258,4 @@ class Service:
             skipped=self._wall_clock.skipped,
         )
         self._out["status"].put(encode(status))
+        return status

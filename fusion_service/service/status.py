@@ -9,9 +9,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from fusion_service.bus import Inbox
+from fusion_service.ways import reason_words
 from schemas import Status
 
-__all__ = ["StatusMaker"]
+__all__ = ["StatusMaker", "status_line"]
+
+NAMED = 5
+"""Sources that a line names; of more it says the number."""
 
 
 class StatusMaker:
@@ -79,3 +83,18 @@ class StatusMaker:
             },
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         )
+
+
+def status_line(status: Status) -> str:
+    """A status in a line: tracks, sources, and whose tracks are no tracklets, where that is asked for."""
+    tracks = ", ".join(f"{count} {name}" for name, count in status.tracks.items()) or "no step yet"
+    alive = sum(bool(said.get("alive")) and not said.get("stale") for said in status.sources.values())
+    line = f"{tracks}; {alive} of {len(status.sources)} sources alive"
+    shares = {name: said for name, said in status.sources.items() if "tracklets" in said}
+    if not shares:
+        return line
+    without = {name: said["no_tracklets"] for name, said in shares.items() if said.get("no_tracklets")}
+    line = f"{line}; tracklets of {len(shares) - len(without)}"
+    if len(without) > NAMED:
+        return f"{line}, none of {len(without)}"
+    return line + "".join(f"; none of {name}: {reason_words(why)}" for name, why in without.items())

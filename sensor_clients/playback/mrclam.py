@@ -12,7 +12,7 @@ both in the correlation group "robotN":
                   as it changes; what its heading adds is in the covariances.
     robotN-self   itself, one track. Its covariance is the whole: a source of its own, so that nothing is added to it.
 
-Both report at full seconds. Truth and tracks say nothing while a robot has not found its place.
+Both report at full seconds, and say nothing while the robot does not know its place.
 """
 
 from __future__ import annotations

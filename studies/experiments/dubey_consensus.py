@@ -11,8 +11,9 @@ master: no service hears another.
 
 In a round each node publishes one message; each service receives four, makes one step, and publishes. Missions follow
 each other ten minutes apart in their own time. Every node simulates the whole world from the same seed, but publishes
-its own track only, and of the others it knows what its own service says. The messages' lineage names the four trackers,
-since a track that was fed back contains the data of all.
+its own track only, and of the others it knows what its own service says. The messages tell no lineage, though a track
+that was fed back contains the data of all: a service that knew would fuse by covariance intersection, and the study is
+of what the rule makes of them.
 
 The batch is the same missions from the same seeds in one process without a bus: `fuse_last` on the tracks that run
 alone, and `studies.sonobuoys.fly` with consensus for those that are fed back.
@@ -156,7 +157,7 @@ def _track(number: int, endpoint: str, missions: Missions, name: str, stop: thre
         bus = stack.enter_context(open_bus([endpoint], wait=PATIENCE, stop=stop))
         bus.subscribe(global_key(name, "tracks"), on_picture, history=0)
         bus.subscribe(global_key("*", "status"), on_status)
-        publisher = TrackPublisher(SOURCES[number], connect=endpoint, origin="simulated", lineage=SOURCES, stop=stop)
+        publisher = TrackPublisher(SOURCES[number], connect=endpoint, origin="simulated", stop=stop)
         stack.enter_context(publisher)
         publisher.info(frame=FRAME, position=(0.0, 0.0, 0.0), period=T, motion=Motion("cv", Q1))
         if not begin.wait(PATIENCE):

@@ -69,7 +69,8 @@ from studies.study import Floats, Result, Row, Run, Study
 CATEGORIES = {"A": (4, 10, 15), "B": (2, 5, 7, 8, 11, 12, 13, 14, 16), "C": (3, 6, 9, 17, 20)}
 PAPERS = ("ci", "ici", "hmd-ga")
 OURS = ("naive", "bci:max_correlation=0.5")
-SETTINGS = tomllib.loads(THREE_RADARS)
+SETTINGS = {**tomllib.loads(THREE_RADARS), "motion": {"kind": "cv", "q": 10.0}}
+"""Of the demo's centre, with a motion of global tracks that allows for the turns of aircraft."""
 STATE = ("x", "y", "vx", "vy")
 MEMORIES = ("restart", "recursive", "sequential", f"sequential q={TRACKER.motion.q:g}")
 TRACKLETS = ("ci tracklet", f"ci tracklet q={TRACKER.motion.q:g}")

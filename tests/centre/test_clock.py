@@ -268,3 +268,20 @@ def test_the_reason_is_late_or_future() -> None:
     assert faults == ["", "", "", "late", ""]
     assert one.fault(messages[-1], START) == "future"
     assert one.fault(tracks("other", WRONG, np.zeros((0, 4)), seq=0), START + 10**7 * SECOND) == "future"
+
+
+def test_another_centre_is_waited_for_only_where_nobody_else_is() -> None:
+    """Two centres that exchange their pictures would wait for each other; one above others has nobody else."""
+    one = clock()
+    for name in ("radar", "global/B"):
+        one.presence(name, True)
+    assert see(one, "global/B", 1.0)
+    assert see(one, "radar", 2.0)
+    assert drain(one) == [1.0, 2.0]
+    top = clock()
+    for name in ("global/A", "global/B"):
+        top.presence(name, True)
+    assert see(top, "global/A", 2.0)
+    assert drain(top) == []
+    assert see(top, "global/B", 2.0)
+    assert drain(top) == [2.0]

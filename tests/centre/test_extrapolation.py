@@ -148,7 +148,7 @@ def test_an_acceleration_that_nobody_has_is_covered(motion: Motion, ends: bool) 
 @pytest.mark.parametrize(("told", "honest"), [(Motion("cv", 1e-3), False), (Motion("ou", sigma=3.0, tau=25.0), True)])
 def test_a_wrong_motion_is_seen(told: Motion, honest: bool) -> None:
     """What the other tests measure tells a motion that says too little from one that says too much."""
-    mean, error = mission(OU, told, SPACE)
+    mean, error = mission(OU, told, SPACE, settings={"motion": Motion("cv", 1.0)})
     print(f"seed {SEED} told {told}: NEES/n {mean:.3f} +- {error:.3f}")
     assert (mean < 1 - 4 * error) if honest else (mean > 1 + 4 * error)
 

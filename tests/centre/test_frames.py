@@ -162,4 +162,5 @@ def test_outvoted_needs_more_than_half_that_agree() -> None:
     assert outvoted(votes(FRAME, DOCK, DOCK), SPACE, FRAME) == DOCK
     assert outvoted(votes(OTHER, FRAME, DOCK), SPACE, FRAME) is None
     assert convertible(Vote(OTHER, SPACE, 0), FRAME)
-    assert not convertible(Vote(OTHER, SPACE, 0), schemas.Ecef())
+    assert convertible(Vote(OTHER, SPACE, 0), schemas.Ecef())  # with a height that takes in all that flies
+    assert not convertible(Vote(OTHER, ("x", "y", "vx"), 0), schemas.Ecef())

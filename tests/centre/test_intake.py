@@ -46,8 +46,7 @@ HOSTILE = {
     "future": (broken(time=START + 10**8 * SECOND), "future", 1),
     "future epoch": (broken(epoch=2**64 - 1), "future", 1),
     "late": (broken(time=START - 10 * SECOND), "late", 1),
-    "space": (broken(space=("x", "y", "z", "vz")), "space", 1),
-    "loop": (broken(lineage=("r9", "centre")), "loop", 1),
+    "loop": (broken(source="global/centre"), "loop", 1),
     "own name": (broken(source="centre"), "loop", 1),
     "other frame": (broken(frame=schemas.Local("dock")), "frame", 3),
     "bad period": (info("r1", seq=5, period=-1.0), "bad-info", 1),
@@ -236,8 +235,9 @@ def test_a_filler_of_before_the_first_message_mends_no_gap() -> None:
 
 def test_a_track_whose_density_overflows_on_its_way_is_told() -> None:
     made = FusionCentre({"source_defaults": {"period": 1e5}})
-    wild = np.array([1.0, 1.0, 1e11, 1e11])
-    give(made, info("r1", period=1e5), tracks("r1", 1, [[0, 0, 0, 0]], sigma=wild))
+    wild = np.array([1.0, 1.0, 9e3, 9e3])  # vaguer, and the velocity were none
+    told = info("r1", period=1e5, motion=schemas.Motion("cv", 0.0))
+    give(made, told, tracks("r1", 1, [[0, 0, 0, 0]], sigma=wild))
     result = step(made, 2e5)
     assert len(result.tracks.ids) == 0
     assert result.status.refused.get("ill-conditioned", 0) == 1

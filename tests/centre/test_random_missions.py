@@ -73,8 +73,8 @@ def check_contributors(picture: schemas.GlobalTracks, log: schemas.StepLog) -> N
     assert set(local) <= known
 
 
-def check(seed: int) -> Mission:
-    mission = random_missions.fly(seed)
+def check(seed: int, partial: bool = False) -> Mission:
+    mission = random_missions.fly(seed, partial=partial)
     check_sound(mission)
     recorded = [said(result) for result in mission.results]
     rng = np.random.default_rng(seed)
@@ -91,6 +91,22 @@ def check(seed: int) -> Mission:
 def test_any_mission(seed: int) -> None:
     print("seed", seed)
     check(seed)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_any_mission_of_sources_that_do_not_tell_all(seed: int) -> None:
+    print("seed", seed)
+    mission = check(seed, partial=True)
+    if seed == 0:
+        spaces = {
+            event.space
+            for one in (random_missions.fly(k, partial=True) for k in range(8))
+            for given in one.given
+            for event, _ in given.events
+            if isinstance(event, schemas.LocalTracks)
+        }
+        assert len(spaces) > 4
+        assert any((result.tracks.contributor_counts > 1).any() for result in mission.results)
 
 
 @pytest.mark.parametrize("seed", [1098, 1102])

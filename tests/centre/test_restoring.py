@@ -109,20 +109,21 @@ def test_components_that_only_the_config_has_are_unknown_and_ids_go_on() -> None
     again = FusionCentre({"lateness": 3.0, "space": list(wanted), "coast": 100.0}, made.checkpoint())
     after = step(again, 5).tracks
     assert after.ids.tolist() == before.ids.tolist()
-    assert (after.contributor_counts == 0).all()  # no local track has what the picture now asks for
+    assert (after.contributor_counts == before.contributor_counts).all()  # with what they have
     at = [wanted.index(name) for name in before.space]
     ahead = moved(before.means, 1.0)
     np.testing.assert_allclose(after.means[:, at], ahead, atol=1e-6)
-    assert (np.sqrt(after.covariances[:, 2, 2]) >= 1e4).all()
-    # a source that has them takes over the ids
+    assert (np.sqrt(after.covariances[:, 2, 2]) >= 1e6).all()
+    # a source that has them joins, and height comes in
     states = np.concatenate([ahead[:, :2], np.full((4, 1), 50.0), ahead[:, 2:], np.zeros((4, 1))], axis=1)
     sigma = np.diag([30.0, 30.0, 30.0, 2.0, 2.0, 2.0]) ** 2
     covariances = np.tile(sigma, (4, 1, 1))
     message = dataclasses.replace(tracks("r3", 5, ahead), space=wanted, means=states, covariances=covariances)
     give(again, info("r3"), message)
     taken = step(again, 6).tracks
-    assert taken.contributor_counts.sum() == 4
-    assert np.isfinite(taken.means).all()
+    assert taken.ids.tolist() == before.ids.tolist()
+    assert (taken.contributor_counts == 3).all()
+    np.testing.assert_allclose(taken.means[:, 2], 50.0, atol=1.0)
 
 
 def test_a_checkpoint_of_the_release_before_is_read() -> None:

@@ -178,7 +178,7 @@ def test_a_late_source_is_put_in_its_place() -> None:
     assert np.abs((picture.means[order] - in_time.means[at]) / sigma[at]).max() < 1e-3
     assert np.abs(np.diagonal(picture.covariances[order], axis1=1, axis2=2) / sigma[at] ** 2 - 1).max() < 1e-3
     assert ways(picture) == {"tracklet"}
-    assert late.result.status.sources["b"]["tracklets"] > 0.95
+    assert late.result.status.sources["b"]["tracklets"] > 0.9
 
 
 @pytest.mark.parametrize(
@@ -209,8 +209,7 @@ def test_a_source_that_says_nothing_of_its_motion_goes_by_the_rule() -> None:
         world.hear(*(world.look(name) for name in world.filters))
         picture = world.step(float(t))
     assert world.result.status.sources["b"]["no_tracklets"] == "motion"
-    assert ways(picture) == {"tracklet"}, "the track has one row that gives tracklets"
-    assert np.linalg.eigvalsh(picture.covariances[0] - world.filters["b"].P).max() < 1e-6, "no worse than either row"
+    assert ways(picture) == {"ci"}, "a filter of one row would only do again what its tracker has done"
 
 
 def test_a_tracker_that_is_too_sure_is_seen_and_left_out() -> None:
@@ -261,3 +260,21 @@ def test_a_common_error_never_averages_out() -> None:
         picture = world.step(float(t))
     expected = world.filters["a"].P + np.diag([900.0, 400.0, 0.0, 0.0])
     assert np.abs(picture.covariances - expected).max() < 1e-6 * 900
+
+
+def test_a_note_says_in_words_why_there_are_no_tracklets_and_only_where_they_are_asked_for() -> None:
+    derived: dict[str, Any] = {"memory": "restart", "rule": "bar-shalom-campo", "rule_options": {"cross": "derived"}}
+    for asked in (True, False):
+        world = World({"a": 8.0, "b": 13.0}, seed=4, **({} if asked else derived))
+        world.say("a")
+        for t in range(1, 5):
+            world.move(float(t))
+            world.hear(*(world.look(name) for name in world.filters))
+            world.step(float(t))
+            told = [event for event in world.result.log.events if event["kind"] == "tracklets"]
+            assert len(told) == (asked and t == 1)
+        sources = world.result.status.sources
+        assert sources["a"]["note"] == ""
+        assert sources["b"]["note"].startswith("no tracklets of it: nobody declares") == asked
+        assert ("tracklets" in sources["a"]) == asked
+        assert sources["a"]["innovation"] > 0

@@ -14,6 +14,8 @@ from fusion_service import commands
 from fusion_service.cli import main
 from fusion_service.commands import COMMANDS, arguments
 from fusion_service.process import argument, data_folder, positive, whole
+from fusion_service.review.replay.variants import variants_of
+from fusion_service.rules import RULES
 
 FILES = {path.stem for path in Path(commands.__path__[0]).glob("*.py")} - {"__init__", "arguments"}
 
@@ -78,3 +80,43 @@ def test_data_are_in_the_folder_or_in_one_of_their_name_in_it(tmp_path: Path, mo
     assert data_folder("autoferry") == tmp_path / "autoferry"
     assert data_folder("other") == tmp_path
     assert data_folder("other", "given") == Path("given")
+
+
+def test_auto_is_among_the_rules(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["rules"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split()[0] for line in lines[::2]] == [*RULES, "auto"]
+    assert "max_correlation" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("asked", "words"),
+    [
+        (["--set", "rule_options.delta=0.5"], "auto has no option 'delta' (known: criterion, max_correlation)"),
+        (
+            ["--set", "rule_options.max_correlation=0.5"],
+            "auto takes max_correlation as a table of bounds between groups",
+        ),
+        (["--set", "rule_options.max_correlation={within = 2}"], "max_correlation.within is 2, must be a number from"),
+        (["--criterion", "size"], "auto cannot fuse 1 source here: criterion 'size': one of det, trace"),
+        (["--memory", "recursive"], "memory: is recursive, which rule auto does not take"),
+    ],
+)
+def test_what_auto_does_not_take_is_told_in_one_line(
+    asked: list[str], words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--rule", "auto", *asked]) == 2
+    told = capsys.readouterr().err
+    assert words in told
+    assert told.count("\n") == 1
+    assert "bci" not in told
+
+
+def test_the_demo_and_a_replay_take_tracklets_and_auto() -> None:
+    parser = argparse.ArgumentParser()
+    COMMANDS["demo"].add(parser)
+    for memory in ("restart", "recursive", "tracklet"):
+        assert parser.parse_args(["--memory", memory, "--rule", "auto"]).memory == memory
+    for one in variants_of(["auto", "ci"], ["memory=tracklet"], ()):
+        assert one.config({}).by_tracklets
+        assert one.config({}).rule == one.name

@@ -72,7 +72,7 @@ x = 1
 @pytest.mark.parametrize(
     ("raw", "words"),
     [
-        ({"rule_options": {"colour": 1}}, "ci has no option 'colour' (known: "),
+        ({"rule_options": {"colour": 1}}, "auto has no option 'colour' (known: "),
         ({"rule": 7}, "must be one of"),
         ({"frame": {"kind": "ecef"}}, "an ECEF picture needs x, y and z"),
         ({"sources": {"bad name": {}}}, "bad name"),
@@ -204,7 +204,7 @@ def test_a_source_takes_the_defaults_that_it_does_not_change() -> None:
 
 def test_the_hash_tells_configs_apart_and_only_them() -> None:
     base = centre_config({})
-    assert config_hash(base) == config_hash(centre_config({"rule": "ci"}))
+    assert config_hash(base) == config_hash(centre_config({"rule": "auto"}))
     changed = [
         centre_config({"rule": "naive"}),
         centre_config({"frame": {"kind": "enu", "lat": 1.0, "lon": 2.0}}),

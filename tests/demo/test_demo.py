@@ -56,7 +56,7 @@ def test_three_radars_from_start_to_score(tmp_path: Path) -> None:
     assert code == 0, errors
     assert processes_with(str(tmp_path)) == []
     result = json.loads(scores.read_text())
-    assert (result["scenario"], result["rule"]) == ("three-radars", "ci")
+    assert (result["scenario"], result["rule"]) == ("three-radars", "auto")
     assert set(result["sources"]) == {"radar1", "radar2", "radar3"}
     for numbers in (*result["sources"].values(), result["fused"]):
         assert set(numbers) == PARTS

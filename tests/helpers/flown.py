@@ -56,8 +56,10 @@ class Flight:
         key = schemas.truth_key(message.source, REALM)
         if what is not None:
             key = schemas.local_key(message.source, what, REALM)
-            if give:
-                self.centre.handle(message, received)
+        elif message.type == "global_tracks":
+            key = schemas.global_key(message.source, "tracks", REALM)
+        if give and message.type != "truth":
+            self.centre.handle(message, received)
         self.log.append((key, schemas.encode(message), received))
 
     def step(self, at: float) -> StepResult:

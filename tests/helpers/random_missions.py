@@ -63,7 +63,7 @@ def settings(rng: np.random.Generator) -> CentreConfig:
         "period": one(0.5, 1.0),
         "memory": one("restart", "recursive", "tracklet", "tracklet"),
         "memory_correlation": one(1.0, 0.5),
-        "rule": one("ci", "naive", "aa", "ici", "ei", "cu", "hmd-ga", "fast-ci"),
+        "rule": one("ci", "naive", "aa", "ici", "ei", "cu", "hmd-ga", "fast-ci", "auto", "auto", "bci"),
         "mixture_rule": one("moments", "gm-ga", "aa", "cu-modes"),
         "max_components": one(1, 3, 8),
         "publish": one("mixture", "mean", "mode"),
@@ -201,11 +201,29 @@ def tracks_of(
     return dataclasses.replace(message, **{**own, **made})
 
 
+def narrowed(message: schemas.LocalTracks, space: tuple[str, ...]) -> schemas.LocalTracks:
+    """The message with these components alone, as far as it has them."""
+    names = tuple(name for name in space if name in message.space)
+    at = [message.space.index(name) for name in names]
+    covariances = message.covariances[:, at][:, :, at]
+    return dataclasses.replace(message, space=names, means=message.means[:, at], covariances=covariances)
+
+
+def _narrow(message: schemas.LocalTracks, seed: int) -> schemas.LocalTracks:
+    """What each source tells in a mission of partial states: one places alone, others all, one changes its mind."""
+    tells = (("x", "y"), None, ("y", "x", "z", "vy"), None)[(SOURCES.index(message.source[0]) + seed) % 4]
+    if message.source == "b" and message.time // SECOND % 7 == seed % 7:
+        tells = ("x", "y", "vx", "vy")
+    return message if tells is None else narrowed(message, tells)
+
+
 @cache
-def fly(seed: int, steps: int = 14) -> Mission:
-    """The mission of a seed."""
+def fly(seed: int, steps: int = 14, partial: bool = False) -> Mission:
+    """The mission of a seed; partial: with sources that do not tell all of the state."""
     rng = np.random.default_rng(seed)
     config = settings(rng)
+    if partial and seed % 2:
+        config = dataclasses.replace(config, space=LONG)
     centre = FusionCentre(config, generation=GENERATION, epoch=START)
     sources = [_Source(name, rng) for name in SOURCES[: int(rng.integers(2, 5))]]
     close = rng.random() < 0.5
@@ -228,6 +246,8 @@ def fly(seed: int, steps: int = 14) -> Mission:
         for source in sources:
             sent = _sent(source, moved(states, clock), clock, number)
             for message in sent:
+                if partial and isinstance(message, schemas.LocalTracks) and message.source in SOURCES:
+                    message = _narrow(message, seed)
                 (waiting if rng.random() < 0.12 else messages).append(message)
                 if rng.random() < 0.08:
                     messages.append(message)

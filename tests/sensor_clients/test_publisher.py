@@ -85,6 +85,7 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
                 kind=[None, "ship"],
                 kind_p=[0, 1],
                 height=Height(5.0, 2.0),
+                lineages=[["b"], ["a", "b"]],
             )
         )
         radar.intensity(time=5, space=["x", "y"], frame=SITE, weights=[1.5], means=[[1, 2]], covariances=[np.eye(2)])
@@ -103,6 +104,9 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
     assert isinstance(info, SensorInfo)
     assert (info.position, info.period, info.coverage) == ((1.0, 2.0, 3.0), 2.0, Disk(1e4))
     full, empty = by_key[prefix + "tracks"]
+    assert isinstance(full, LocalTracks)
+    assert full.track_lineage is not None
+    assert full.track_lineage.tolist() == [[0b10], [0b11]]
     assert isinstance(full, LocalTracks)
     assert isinstance(empty, LocalTracks)
     assert full.ids.tolist() == [7, 9]

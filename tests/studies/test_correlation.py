@@ -355,3 +355,14 @@ def test_many_quantities_in_groups_become_a_table_each() -> None:
         "| ci | 1.500 | 1.500 | 1.500 | 1.500 | 1.500 |",
     ]
     assert lines[6:10] == ["", "Second:", "", head]
+
+
+def test_what_is_derived_of_filters_is_their_joint_covariance() -> None:
+    """From the covariances alone, three filters that started from one estimate; and nothing is left of that."""
+    tracks = steady(positions(1.0, 0.1, (1.0, 2.0, 3.0)), 300)
+    assert tracks.derived is not None
+    assert tracks.left is not None
+    J = tracks.J.reshape(1, 3, 4, 3, 4).swapaxes(2, 3)
+    for i, j in ((0, 1), (0, 2), (1, 2)):
+        np.testing.assert_allclose(tracks.derived[:, i, j], J[:, i, j], rtol=1e-9, atol=1e-12)
+    assert np.abs(tracks.left).max() < 1e-12

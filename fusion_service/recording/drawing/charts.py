@@ -5,6 +5,7 @@
 /anees/{centre}/mean                  its mean over the targets, with bounds for their number
 /counts/local/{source}  /counts/{centre}/{status}  /influence/{centre}/{source}
 /counts/local/{source}/mass           expected number of objects, of an intensity
+/counts/{centre}/by/{way}             tracks fused in this way, where not all are by the rule
 /existence/{centre}/{track}           existence of each track, from when it is confirmed on
 /track/{centre}/...                   with a `focus`: error, nees with bounds, existence, sigma (m) and
                                       influence/{source} of this one track
@@ -31,6 +32,7 @@ from fusion_service.colours import (
 from fusion_service.recording.columns import ColumnWriter, Stamp, entity, import_rerun
 from fusion_service.recording.drawing.errors import StepErrors
 from fusion_service.recording.drawing.geometry import track_moments
+from fusion_service.ways import fused_by
 from schemas import STATUSES, GlobalTracks, LocalIntensity, LocalTracks
 from schemas.messages import TENTATIVE
 
@@ -38,6 +40,8 @@ __all__ = ["Charts"]
 
 LEGIBLE = 6
 """Series of a chart that has a legend."""
+MAX_WAYS = 16
+"""Ways of fusion of a centre that have a series."""
 MAX_RUNNING = 100
 MAX_SERIES = 1000
 """Series of existence of one centre: at a time (each takes Rerun memory as long as it runs), and in all; of targets
@@ -54,6 +58,7 @@ class Charts:
         self._styles: dict[str, tuple[Colour, str, float]] = {}
         self._targets: set[int] = set()
         self._series: dict[str, set[int]] = {}
+        self._ways: dict[str, list[str]] = {}
 
     @property
     def crowded(self) -> bool:
@@ -91,6 +96,7 @@ class Charts:
             tones = (shade(own, 0.45), own, shade(own, 0.7))
         for name, count, tone in zip(STATUSES, counts.tolist(), tones, strict=True):
             self._add(entity("counts", centre, name), stamp, count, tone, f"{centre}: {name}", 2.0)
+        self._fused_by(message, own, stamp)
         influence = message.contributor_influence
         index = message.contributor_source.astype(np.intp)[np.isfinite(influence)]
         number = np.bincount(index, minlength=len(message.sources))
@@ -101,6 +107,18 @@ class Charts:
         if self._focus is not None:
             self._follow(message, self._focus, colours, own, stamp)
         return self._existence(message, label, stamp)
+
+    def _fused_by(self, message: GlobalTracks, own: Colour, stamp: Stamp) -> None:
+        """How many tracks with a source were fused in each way, once not all are by the rule."""
+        names, which = fused_by(message)
+        known = self._ways.setdefault(message.source, [])
+        if message.rules is not None:
+            known += [name for name in names if name not in known][: MAX_WAYS - len(known)]
+        there = np.bincount(which[message.contributor_counts > 0], minlength=len(names)).tolist()
+        counts = dict(zip(names, there, strict=True))
+        for number, name in enumerate(known):
+            path, tone = entity("counts", message.source, "by", name), shade(own, 0.85 - 0.15 * min(number, 4))
+            self._add(path, stamp, counts.get(name, 0), tone, f"{message.source}: by {name}")
 
     def _existence(self, message: GlobalTracks, label: Callable[[int], str], stamp: Stamp) -> int:
         known = self._series.setdefault(message.source, set())

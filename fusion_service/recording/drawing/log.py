@@ -16,6 +16,7 @@ import numpy as np
 from fusion_service.recording.columns import ColumnWriter, Stamp, documents, entity, texts
 from fusion_service.recording.drawing.labels import utc
 from fusion_service.recording.drawing.tracks import Drawing
+from fusion_service.ways import fused_by, no_tracklets, tracklet_health
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import DECISIONS, KEPT, NO_SOURCE
 
@@ -40,6 +41,7 @@ class EventLog:
         self._epochs: dict[tuple[str, str], int] = {}
         self._health: dict[str, dict[str, str]] = {}
         self._waiting: deque[tuple[str, str, str, int]] = deque(maxlen=WAITING)
+        self._ways: dict[str, str] = {}
 
     def say(self, about: str, level: str, text: str, stamp: Stamp) -> None:
         """One line. What has no mission time waits for the next that has."""
@@ -101,6 +103,10 @@ class EventLog:
             kind = str(event.get("kind", "event"))
             if kind in SAID_ELSEWHERE:
                 continue
+            if kind == "tracklets":
+                level = WARN if event.get("why") else INFO
+                self.say("sources", level, f"source {_short(event.get('source'))}: {no_tracklets(event)}", stamp)
+                continue
             rest = ", ".join(f"{key} {_short(value)}" for key, value in event.items() if key not in ("kind", "epoch"))
             self.say("services", INFO, f"service {message.source}: {kind}{f' ({rest})' if rest else ''}", stamp)
         if self._focus is not None:
@@ -129,6 +135,19 @@ class EventLog:
             self.say("tracks", INFO, f"track {self._label(track)}{whose} ended: {reason}{into}", stamp)
         for new, old in message.split_from:
             self.say("tracks", INFO, f"track {self._label(new)}{whose} split from {self._label(old)}", stamp)
+        if self._focus is not None:
+            self._fused_by(message, self._focus, stamp)
+
+    def _fused_by(self, message: GlobalTracks, track: int, stamp: Stamp) -> None:
+        """A line when `track` is fused in another way than before, once not all are by the rule."""
+        names, which = fused_by(message)
+        if message.rules is None and message.source not in self._ways:
+            return
+        for row in np.flatnonzero(message.ids == np.uint64(track)).tolist():
+            way = names[which[row]]
+            if self._ways.get(message.source) != way:
+                self._ways[message.source] = way
+                self.say("track", INFO, f"{message.source}: fused by {way}", stamp)
 
 
 def _state(said: dict[str, Any]) -> str:
@@ -153,6 +172,10 @@ def _page(message: Status) -> str:
         cells = [said.get(key, "") for key in ("messages", "tracks", "offset", "gaps", "repeats")]
         shown = [f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in cells]
         lines.append(f"| {' | '.join([name, _state(said), *shown])} |")
+    told = [(name, tracklet_health(said)) for name, said in message.sources.items()]
+    if any(text for _, text in told):
+        lines += ["", "| source | tracklets and innovations |", "|---|---|"]
+        lines += [f"| {name} | {text} |" for name, text in told if text]
     for title, numbers in (
         ("refused", message.refused),
         ("dropped", message.dropped),

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fusion_service.ways import fused_by
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import BROKEN, CONFIRMED, GATE_FAILED, KEPT
 
@@ -17,13 +18,17 @@ __all__ = ["Account"]
 class Account:
     """What a centre's pictures and step logs say of its work.
 
-    rules: those it named. shown: pictures' confirmed tracks by number of their sources. ended: reason -> tracks.
-    refused, dropped: (source, reason, "messages" or "tracks") -> how many. kept, failed, broken: source -> links that
-    agreed, did not, were cut; innovation: source -> (n, sum of d2) of a link against the fusion of the other sources.
-    dimension: of that d2, 0 without pictures. status: the newest, None without.
+    rules: those it named. ways: steps of confirmed tracks with a source, by what they were fused by. ungiven: source ->
+    why its tracks are no tracklets, by the newest step log that says so, "" where they are. shown: pictures' confirmed
+    tracks by number of their sources. ended: reason -> tracks. refused, dropped: (source, reason, "messages" or
+    "tracks") -> how many. kept, failed, broken: source -> links that agreed, did not, were cut; innovation: source ->
+    (n, sum of d2) of a link against the fusion of the other sources. dimension: of that d2, 0 without pictures.
+    status: the newest, None without.
     """
 
     rules: Counter[str] = field(default_factory=Counter)
+    ways: Counter[str] = field(default_factory=Counter)
+    ungiven: dict[str, str] = field(default_factory=dict)
     shown: Counter[int] = field(default_factory=Counter)
     pictures: int = 0
     steps: int = 0
@@ -46,11 +51,17 @@ class Account:
         self.runs.add(message.epoch)
         self.shown.update(message.contributor_counts[message.status == CONFIRMED].tolist())
         self.ended.update(reason for _, reason, _ in message.ended)
+        names, which = fused_by(message)
+        fed = (message.status == CONFIRMED) & (message.contributor_counts > 0)
+        self.ways.update(dict(zip(names, np.bincount(which[fed], minlength=len(names)).tolist(), strict=True)))
 
     def log(self, message: StepLog) -> None:
         """Enter a step log."""
         self.steps += 1
         self.runs.add(message.epoch)
+        for event in message.events:
+            if event.get("kind") == "tracklets":
+                self.ungiven[str(event.get("source", ""))] = str(event.get("why", ""))
         for counter, entries in ((self.refused, message.refused), (self.dropped, message.dropped)):
             for entry in entries:
                 what = "tracks" if entry.count else "messages"

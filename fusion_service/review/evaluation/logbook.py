@@ -22,6 +22,7 @@ from fusion_service.review.evaluation.latency import Delays, Latency
 from fusion_service.review.evaluation.traffic import Traffic
 from fusion_service.review.snapshots import Times, TrackMessage
 from schemas import (
+    UNKNOWN_SIGMA,
     Frame,
     GlobalTracks,
     LocalIntensity,
@@ -46,7 +47,8 @@ class Logbook:
     """One mission. `Logbook(messages)` of what is in memory, `Logbook.read(path)` of a recording.
 
     truths; infos: newest of each source; accounts: by centre; traffic: by ("local", "intensity" or "global", name);
-    latency: by (kind, name); bad: messages that do not decode, by reason; counts: messages by type.
+    latency: by (kind, name); bad: messages that do not decode, by reason; counts: messages by type; flat: centres
+    with a track whose height nobody told.
     """
 
     def __init__(self, messages: Iterable[Message] = ()) -> None:
@@ -59,6 +61,7 @@ class Logbook:
         self.counts: Counter[str] = Counter()
         self.origins: Counter[str] = Counter()
         self.first_pictures: dict[str, GlobalTracks] = {}
+        self.flat: set[str] = set()
         self.received: tuple[int, int] | None = None
         self.path: Path | None = None
         self._spaces: dict[str, set[tuple[tuple[str, ...], Frame]]] = {}
@@ -216,11 +219,15 @@ class Logbook:
         self._note_traffic(kind, message, len(message.ids), arrival, received)
         at = [message.space.index(axis) for axis in "xyz" if axis in message.space]
         with np.errstate(all="ignore"):
-            spread = np.sqrt(message.covariances[:, at, at].mean(axis=1))
+            variance = message.covariances[:, at, at]
+            told = variance < [UNKNOWN_SIGMA.get(message.space[k], np.inf) ** 2 for k in at]
+            spread = np.sqrt(np.where(told, variance, 0.0).sum(axis=1) / told.sum(axis=1))
         if len(spread) and np.isfinite(typical := float(np.median(spread))):
             self._spreads[kind].append(typical)
         if isinstance(message, GlobalTracks):
             self._account(name).picture(message)
+            if not told.all():
+                self.flat.add(name)
             first = self.first_pictures.setdefault(name, message)
             if (message.time, message.epoch) < (first.time, first.epoch):
                 self.first_pictures[name] = message

@@ -53,7 +53,8 @@ def reference_for(
     motion: Motion | None,
     c: float,
 ) -> Reference:
-    """The reference of a mission; frame and space: by default those of the first picture of the first of `centres`.
+    """The reference of a mission; frame and space: by default those of the first picture of the first of `centres`,
+    but on the plane where one of these has a track of unknown height.
 
     motion: of sources without an info. c: the cut-off, m. Raises `NothingToScoreError` for a centre without tracks, and
     where nothing says a frame and a space.
@@ -64,7 +65,8 @@ def reference_for(
             raise NothingToScoreError(f"no tracks of a centre {name!r} (there are: {there})")
     if centres:
         first = book.first_pictures[centres[0]]
-        frame, space = frame or first.frame, space or first.space
+        whole = tuple(name for name in first.space if name != "z" or not book.flat & set(centres))
+        frame, space = frame or first.frame, space or whole
     if frame is None or space is None:
         raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
     axes = tuple(name for name in "xyz" if name in space)

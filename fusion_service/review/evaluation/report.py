@@ -34,7 +34,9 @@ from fusion_service.review.evaluation.tables import (
     rules_table,
     sentence,
     tracking_table,
+    way_shares,
 )
+from fusion_service.ways import reason_words
 
 __all__ = ["need_matplotlib", "report"]
 
@@ -248,6 +250,11 @@ def _without_truth(one: Assessment, which: str) -> list[str]:
             found.append(f"<h3>How many sources feed a confirmed track{escape(of)}</h3>")
             shares = [["share", *(percent(count / shown) for _, count in parts)]]
             found.append(_table(["sources", *(n for n, _ in parts)], shares))
+        if ways := way_shares(account):
+            found.append(f"<h3>What confirmed tracks were fused by{escape(of)}</h3>")
+            found.append(_table(["", *(way for way, _ in ways)], [["share", *(share for _, share in ways)]]))
+        if reasons := [[name, reason_words(why)] for name, why in sorted(account.ungiven.items()) if why]:
+            found.append(_table(("no tracklets of", "because"), reasons, left=2))
         if lines := links(account):
             found.append(f"<h3>Links against the fusion of the others{escape(of)}</h3>")
             found.append(_table(("", "kept", "failed a gate", "cut", "mean d² / n"), lines))

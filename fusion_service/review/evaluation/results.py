@@ -147,6 +147,8 @@ def _centre(one: Assessment, name: str) -> dict[str, Any]:
     reasons = {"refused": account.refused, "dropped": account.dropped}
     return {
         "rules": dict(account.rules),
+        "fused_by": dict(account.ways),
+        "no_tracklets": {source: why for source, why in sorted(account.ungiven.items()) if why},
         "runs": len(account.runs),
         "steps": account.steps,
         "confirmed_by_sources": {str(n): count for n, count in sorted(account.shown.items())},

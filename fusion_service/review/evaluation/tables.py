@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fusion_service.ways import reason_words
+
 if TYPE_CHECKING:
     from fusion_service.review.evaluation.account import Account
     from fusion_service.review.evaluation.assess import Assessment, Evaluation
@@ -33,6 +35,7 @@ __all__ = [
     "sentence",
     "tracking_table",
     "truthless_lines",
+    "way_shares",
 ]
 
 RAISED = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -349,6 +352,9 @@ def _account_lines(account: Account) -> list[str]:
     if shown:
         parts = [f"{percent(count / shown)} by {_sources(n)}" for n, count in sorted(account.shown.items())]
         lines.append(f"Confirmed tracks are fed: {', '.join(parts)}.")
+    if ways := way_shares(account):
+        lines.append(f"Confirmed tracks were fused by {', '.join(f'{way} {share}' for way, share in ways)}.")
+    lines += [f"{name}: no tracklets: {reason_words(why)}" for name, why in sorted(account.ungiven.items()) if why]
     table = [["links of", "kept", "failed a gate", "cut", "mean d2 / n"], *links(account)]
     if len(table) > 1:
         lines += ["", "Each source against the fusion of the others (equal weights, cautious: below 1 is usual):"]
@@ -357,6 +363,15 @@ def _account_lines(account: Account) -> list[str]:
         for (source, reason, what), count in sorted(counter.items()):
             lines.append(f"{verb}: {count} {what} of {source or 'several'}: {reason}")
     return lines
+
+
+def way_shares(account: Account) -> list[tuple[str, str]]:
+    """Share of the steps of confirmed tracks that each way of fusion has, the most frequent first; none where all went
+    by the rule."""
+    ways = +account.ways
+    if set(ways) <= set(account.rules):
+        return []
+    return [(way, percent(count / ways.total())) for way, count in ways.most_common()]
 
 
 def _sources(n: int) -> str:

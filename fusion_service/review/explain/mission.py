@@ -17,6 +17,7 @@ from fusion_service.recording import RawMessage, read
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.steps import Step, Steps
 from fusion_service.recording.survey import RecordedCentre, key_of, survey
+from fusion_service.review.explain.fused_by import FusedBy
 from fusion_service.review.explain.histories import TrackHistories
 from fusion_service.review.explain.story import Story
 from schemas import GlobalTracks, MessageError, StepLog, decode
@@ -48,12 +49,13 @@ class Refusals:
 @dataclass
 class RecordedMission:
     """What was read of a centre. Times in ns; start: of its first step; steps: how many; story: of the track asked
-    for; config: its newest settings, None where they are not known."""
+    for; fused_by: by which way its tracks were fused; config: its newest settings, None where they are not known."""
 
     path: Path
     centre: RecordedCentre
     histories: TrackHistories = field(default_factory=TrackHistories)
     labels: Labels = field(default_factory=Labels)
+    fused_by: FusedBy = field(default_factory=FusedBy)
     start: int = 0
     steps: int = 0
     rule: str = ""
@@ -165,13 +167,12 @@ class _Reader:
         if step.log is not None:
             self._settings(step.log)
             self._refused(step.log)
-        if self._track is None:
-            return
-        if mission.story is None:
+        if self._track is not None and mission.story is None:
             track = mission.labels.find(self._track)
             mission.story = None if track is None else Story(track, self._until)
         if mission.story is not None:
             mission.story.step(step, self._recent)
+        mission.fused_by.step(step, None if mission.story is None else mission.story.track)
 
     def _settings(self, log: StepLog) -> None:
         tables = self._mission.centre.settings.get(log.config_hash)

@@ -87,6 +87,7 @@ def _global(message: GlobalTracks, track: int) -> GlobalTracks:
         message,
         **_densities(message, rows),
         **columns,
+        **_said(message, rows),
         contributor_counts=message.contributor_counts[rows],
         ended=tuple(one for one in message.ended if track in (one[0], one[2])),
         split_from=tuple(one for one in message.split_from if track in one),
@@ -94,20 +95,29 @@ def _global(message: GlobalTracks, track: int) -> GlobalTracks:
 
 
 COLUMNS = ("source", "epoch", "id", "influence")
+TEXTS = ("identity", "kind", "callsign")
+OPTIONAL = ("kind_p", "identity_p", "track_origin", "marks", "number", "track_lineage", "track_rule")
+
+
+def _said(message: GlobalTracks | LocalTracks, rows: NDArray[np.bool_]) -> dict[str, Any]:
+    """The optional columns that it has, of some of its tracks."""
+    found: dict[str, Any] = {}
+    for name in (*TEXTS, *OPTIONAL):
+        column = getattr(message, name, None)
+        if column is not None:
+            some = (one for one, kept in zip(column, rows.tolist(), strict=True) if kept)
+            found[name] = tuple(some) if name in TEXTS else column[rows]
+    return found
 
 
 def _local(message: LocalTracks, rows: NDArray[np.bool_]) -> LocalTracks:
-    def texts(column: tuple[str | None, ...] | None) -> tuple[str | None, ...] | None:
-        return None if column is None else tuple(one for one, kept in zip(column, rows, strict=True) if kept)
-
-    names = ("existence", "updated", "kind_p")
+    names = ("existence", "updated")
     columns: dict[str, Any] = {name: getattr(message, name) for name in names if getattr(message, name) is not None}
     return replace(
         message,
         **_densities(message, rows),
         ids=message.ids[rows],
-        identity=texts(message.identity),
-        kind=texts(message.kind),
+        **_said(message, rows),
         **{name: column[rows] for name, column in columns.items()},
     )
 

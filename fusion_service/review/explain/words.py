@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
 from fusion_service.recording.drawing.labels import utc
+from fusion_service.review.explain.fused_by import SourceSaid, shares
 from fusion_service.review.explain.histories import GONE, TrackHistory
 from fusion_service.review.explain.mission import RecordedMission, Refusals
 from fusion_service.review.explain.story import CAME, WENT, Composition, Happening, Link, Member, Story, local_messages
@@ -58,7 +59,14 @@ def listing(mission: RecordedMission, *, everything: bool = False) -> str:
     never = f"; {left} more were never confirmed (--all lists them)" if left else ""
     count = f"{len(shown)} track{'s' * (len(shown) != 1)}"
     tail = f"{count}{never}. Ask for one: fusion-service explain {mission.path} --track NUMBER"
-    return "\n".join([head, *_table(rows, left=(0, 5, 6)), tail])
+    return "\n".join([head, *_table(rows, left=(0, 5, 6)), *_ways(mission), tail])
+
+
+def _ways(mission: RecordedMission) -> list[str]:
+    """By which ways confirmed tracks were fused, and whose tracks were no tracklets at the end, and why."""
+    ways = mission.fused_by
+    said = [f"{one.source}: {one.text} (since {mission.seconds(one.time):.1f} s)" for one in ways.ungiven()]
+    return [f"fused by: {shares(ways.all)} of the steps of confirmed tracks", *said] if ways.several or said else []
 
 
 def _became(mission: RecordedMission, life: TrackHistory) -> str:
@@ -107,10 +115,12 @@ class _Teller:
         existence = f"existence {low:.2g}" if low == high else f"existence {low:.2g} to {high:.2g}"
         whole = f" (id {track}, generation {track >> 32})" if track >> 32 else ""
         span = f"{self.time(story.first)} to {self.time(story.last)} s"
+        ways = mission.fused_by
+        by = f"; fused by {shares(ways.steps)}" if ways.several and ways.steps else ""
         return [
             f"track {self.label(track)}{whole} of centre {mission.centre.name} in {mission.path}",
             f"mission from {utc(mission.start, 'T')}, {mission.steps} steps, rule {mission.rule}{gates}",
-            f"lived from {span}, {story.steps} steps: {status}; {existence}",
+            f"lived from {span}, {story.steps} steps: {status}; {existence}{by}",
         ]
 
     def timeline(self) -> list[str]:
@@ -118,6 +128,7 @@ class _Teller:
         told = sorted(_compact(self.story.happenings), key=lambda one: (one.first, one.what != "born"))
         lines = [(one.first, self._span(one.first, one.last), self._what(one)) for one in told]
         lines += [(one.first, self._span(one.first, one.last), self._refusal(one)) for one in self._refusals()]
+        lines += list(self._fused_by())
         if self.story.ended is not None:
             at = self.story.ended[0]
             lines.append((at, self.time(at), f"ended: {self._end()}"))
@@ -156,6 +167,18 @@ class _Teller:
         parts = [f"{one.messages} messages"] if one.messages else []
         parts += [f"{one.tracks} tracks"] if one.tracks else []
         return f"{one.source}: {' and '.join(parts)} refused ({one.reason})"
+
+    def _fused_by(self) -> Iterator[tuple[int, str, str]]:
+        """Lines of how it was fused, and of its sources that give no tracklets."""
+        ways = self.mission.fused_by
+        if ways.several:
+            yield from ((one.first, self._span(one.first, one.last), str(one)) for one in ways.spells())
+        for said in self._said_of_sources():
+            yield said.time, self.time(said.time), f"{said.source}: {said.text}"
+
+    def _said_of_sources(self) -> list[SourceSaid]:
+        story = self.story
+        return self.mission.fused_by.of((member[0] for member in story.links), story.first, story.last)
 
     def contributions(self) -> list[str]:
         """What each member brought, at the time asked for and over the life of the track."""
@@ -225,12 +248,25 @@ class _Teller:
                 said.append(f"Track {self.label(one.other)} was split off it at {at} s.")
         if story.status["coasting"]:
             said.append(f"It coasted for {story.status['coasting']} of its {story.steps} steps.")
+        said += self._by()
         heavy = sorted(story.links, key=lambda one: -story.links[one].total)[:3]
         total = sum(story.links[one].total for one in story.links)
         if total > 0:
             parts = [f"{self.name(one)} {story.links[one].total / total:.0%}" for one in heavy]
             said.append(f"Over its life its data came from {', '.join(parts)}.")
         return said
+
+    def _by(self) -> list[str]:
+        """How it was fused, and whose tracks were no tracklets in the end."""
+        ways = self.mission.fused_by
+        said = []
+        if ways.several and len(ways.steps) > 1:
+            parts = [f"{way} in {count}" for way, count in ways.steps.most_common()]
+            said.append(f"Of {ways.steps.total()} steps with a source it was fused by {', '.join(parts)}.")
+        elif ways.several and ways.steps:
+            said.append(f"It was fused by {next(iter(ways.steps))} all the time.")
+        newest = {one.source: one for one in self._said_of_sources()}
+        return said + [f"{name}: {one.text}." for name, one in sorted(newest.items()) if not one.given]
 
     def _became(self) -> list[str]:
         story = self.story

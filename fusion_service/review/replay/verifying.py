@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fusion_service.centre import StepResult
 from fusion_service.recording.steps import Step
+from fusion_service.ways import fused_by
 from schemas import DECISIONS, STATUSES, GlobalTracks, StepLog, digest
 
 __all__ = ["Difference", "Verdict", "published_as"]
@@ -121,6 +122,7 @@ class _Parts:
 
     def __init__(self, picture: GlobalTracks) -> None:
         self.picture = picture
+        self.ways, self.way = fused_by(picture)
         counts = np.ones(len(picture.ids), dtype=np.intp) if picture.counts is None else picture.counts
         self.components = np.concatenate([[0], np.cumsum(counts, dtype=np.intp)])
         self.contributions = np.concatenate([[0], np.cumsum(picture.contributor_counts, dtype=np.intp)])
@@ -146,6 +148,9 @@ class _Parts:
         for name in _LABELS:
             if (column := getattr(picture, name)) is not None:
                 yield name.replace("_", " "), column[row] if isinstance(column, tuple) else column[row].item()
+        yield "fused by", self.ways[self.way[row]]
+        if picture.track_lineage is not None:
+            yield "lineage", picture.track_lineage[row].tobytes().hex()
         some = slice(self.contributions[row], self.contributions[row + 1])
         who = [
             (picture.sources[source], epoch, track)

@@ -58,6 +58,9 @@ class Rule(Declaration):
 
     fuse: Callable[..., Result]
     takes_weights: bool = True
+    information: bool = False
+    """Whether it takes sources that do not know of all components, padded with variances so large that they are no
+    information: its formula must be one of inverse covariances"""
     refusal: str = "is too ill-conditioned to fuse to within 1e-6"
     """Why a fusion of sound sources is refused."""
 
@@ -83,5 +86,7 @@ class MixtureRule(Declaration):
     fuse: Callable[..., tuple[Mixtures, Floats]]
     intensities: bool = True
     """Whether it fuses intensities too, whose masses count"""
+    information: bool = False
+    """As for `Rule`"""
     multiplies: bool = True
     """Whether the fused components are all combinations of the sources' components, not their union"""

@@ -50,5 +50,6 @@ RULE = MixtureRule(
     promise="keeps modes that all sources share; mass too large, cross terms dropped",
     source="Li-2nd (49)-(51)",
     fuse=gm_ga,
+    information=True,
     takes={**MEAN, "cross_terms": Option("dropped", one_of("dropped", "sampled"))},
 )
