@@ -15,11 +15,11 @@ changed in one thing:
   extended Kalman filters; q = 0.25 m2/s3, on one plane.
 * turns: targets without process noise that turn by 3 or 6 degrees a second, half of the time; filters have cv, q = 1.
 
-Beside it: `ci` with memory restart (the default) and recursive, the best sensor alone (for each target the one that
-states the least variance of position, as it is heard: its last track that has arrived, predicted), and the filter of
-the same kind that has all measurements (centralised). Numbers as in `unequal-sensors`; a run is one target, 50 steps
-after 20 of a second each count (25 after 20 of the radars); but for loss 400 targets at most. Below fifty runs 8 steps
-count, and some worlds are left out.
+Beside it: `ci` with memory restart (the default) and recursive, `rule = "auto"`, the best sensor alone (for each target
+the one that states the least variance of position, as it is heard: its last track that has arrived, predicted), and the
+filter of the same kind that has all measurements (centralised). Numbers as in `unequal-sensors`; a run is one target,
+50 steps after 20 of a second each count (25 after 20 of the radars); but for loss 400 targets at most. Below fifty runs
+8 steps count, and some worlds are left out.
 """
 
 from __future__ import annotations
@@ -41,6 +41,7 @@ from studies.trackers import Sensor, World
 WAYS: tuple[Way, ...] = (
     ("ci restart", {"rule": "ci"}),
     ("ci recursive", {"rule": "ci", "memory": "recursive"}),
+    ("auto", {"rule": "auto"}),
     ("tracklet", {"rule": "ci", "memory": "tracklet"}),
 )
 """What is compared: more are added here."""
@@ -201,8 +202,7 @@ def notes(value: Mapping[tuple[str, str], Row], found: Mapping[str, Flight]) -> 
     )
     hidden = [name for name in found if "hidden" in name]
     seen = "; ".join(
-        f"{name}: innovation {value[name, 'tracklets: innovation furthest from 1'].ours:.2f}, share "
-        f"{value[name, 'tracklets: least share of a source, %'].ours:.0f} %, "
+        f"{name}: innovation {told(OURS, found[name])[2]:.2f}, share {told(OURS, found[name])[1]:.0f} %, "
         + (", ".join(sorted(found[name].failing[OURS])) or "no source taken out")
         for name in hidden
     )
@@ -218,7 +218,7 @@ def draw(figure: Any, value: Mapping[tuple[str, str], Row], names: tuple[str, ..
     panels = figure.subplots(1, 3, sharey=True)
     look = {
         BEST: ("0.6", "o", 9), "ci restart": (colour("ci"), "s", 6), "ci recursive": ("#56b4e9", "D", 4),
-        OURS: (TRACKLET, "*", 12), CENTRALISED: ("k", "|", 14),
+        "auto": ("#1b7837", "x", 6), OURS: (TRACKLET, "*", 12), CENTRALISED: ("k", "|", 14),
     }  # fmt: skip
     for axes, head in zip(panels, HEADS, strict=True):
         for label, (tint, marker, size) in look.items():
