@@ -250,6 +250,6 @@ STUDIES = (
         run=run,
         runs=800,
         quick=12,
-        seconds=90.0,
+        seconds=100.0,
     ),
 )

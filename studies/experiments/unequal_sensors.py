@@ -283,7 +283,7 @@ STUDIES = (
         run=run,
         runs=1600,
         quick=12,
-        seconds=75.0,
+        seconds=110.0,
         takes_rules=True,
     ),
 )
