@@ -20,6 +20,7 @@ REASONS = {
     "registration": "it states an error common to all its tracks",
     "space": "its tracks do not have the components of the picture",
     "innovations": "its innovations are not those that its covariances and its motion say",
+    "dependent": "what it adds agrees with the picture as if it came from it: is its tracker fed with fused tracks?",
     "increments": "most of what its versions add is no measurement",
 }
 """Why a source gives no tracklets, by the word that status and step log have."""

@@ -27,10 +27,12 @@ from fusion_service.centre.versions import Versions
 
 __all__ = ["Increments", "increments"]
 
-NEGATIVE = 1e-3
-"""How far below zero, relative to the information there was, an increment may be: rounding, and frames that turn."""
-RIDGE = 1e-4
-"""Of P_-, added to P_- - P, which has the rank of the measurement only."""
+NEGATIVE = 0.04
+"""How far below zero, relative to the information there was, an increment may be: rounding, frames that turn, and a
+process noise that is declared a tenth too small."""
+RIDGE = 0.05
+"""Of P_-, added to P_- - P, which has the rank of the measurement only: directions in which less than that is gained
+count for little, so that a process noise declared a tenth too large does not count as freedom."""
 LARGEST = 50.0
 """No innovation counts for more, per degree of freedom: one of a manoeuvre says little of all the others."""
 

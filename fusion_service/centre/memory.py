@@ -146,9 +146,10 @@ class Memory:
         some = np.flatnonzero(filtered[:-1])
         cut = self._cut(rows, names, at, len(picture.id), time)[some]
         which = np.searchsorted(picture.id[some], operations.track)
-        states, bases, share = run(base.take(some), which, operations, cut, time, self.motions)
+        states, bases, share, beside = run(base.take(some), which, operations, cut, time, self.motions)
         fresh = operations.row >= 0
         np.add.at(influence, operations.row[fresh], share[fresh])
+        self.watch.add_beside(names, operations.source[fresh], beside[:, fresh])
         tracks.used[filtered[at]] = tracks.time[filtered[at]]
         open_ = operations.take(operations.time > cut[which])
         self._keep(picture, bases, some, open_, ruled)

@@ -132,13 +132,17 @@ class Filters:
 
 def run(
     base: States, at: Ints, operations: Operations, cut: NDArray[np.int64], time: int, motions: Motions
-) -> tuple[States, States, Floats]:  # fmt: skip
+) -> tuple[States, States, Floats, Floats]:  # fmt: skip
     """Every filter's state at `time`, ns, its base for the next step, that is after all operations up to `cut` (G,),
-    and the share (K,) of each operation: trace(K)/n of its gain.
+    the share (K,) of each operation, trace(K)/n of its gain, and the innovation of each increment beside its filter
+    and what it was to be expected to be (2, K).
+
+    With s = vector + dY (x_- - m), whose covariance is S = dY + dY P dY if the increment is independent of the filter,
+    E s'Ps = tr PS, with variance 2 tr (PS)^2: both are scaled so that the variance is twice the expectation.
 
     base (G,); at (K,): which state each operation is for; these in order of (at, time), and none before its base.
     """
-    share = np.zeros(len(at))
+    share, beside = np.zeros(len(at)), np.zeros((2, len(at)))
     if len(at):
         now = States.of(base.time.copy(), base.mean.copy(), base.covariance.copy(), base.motion)
         kept = States.of(base.time.copy(), base.mean.copy(), base.covariance.copy(), base.motion)
@@ -151,13 +155,13 @@ def run(
             some = np.flatnonzero(turn == number)
             which = at[first[some]]
             state = _at(now.take(which), operations.time[first[some]], motions)
-            state = _updated(state, first[some], size[some], operations, share)
+            state = _updated(state, first[some], size[some], operations, share, beside)
             _put(now, which, state)
             done = operations.time[first[some]] <= cut[which]
             _put(kept, which[done], state.take(done))
     else:
         now = kept = base
-    return _at(now, np.full(len(now.time), time, dtype=np.int64), motions), kept, share
+    return _at(now, np.full(len(now.time), time, dtype=np.int64), motions), kept, share, beside
 
 
 def _put(into: States, at: Ints, states: States) -> None:
@@ -175,9 +179,10 @@ def _updated(
     size: Ints,
     operations: Operations,
     share: Floats,
+    beside: Floats,
 ) -> States:
     """States after operations of one time: those of state k are the `size[k]` from `first[k]` on, increments before
-    whole estimates. Writes the shares."""
+    whole estimates. Writes the shares, and the innovations `beside` the states."""
     mean, covariance = states.mean.copy(), states.covariance.copy()
     n = len(mean)
     added = np.zeros_like(covariance)
@@ -189,7 +194,9 @@ def _updated(
         matrix = operations.matrix[:, :, which]
         added[:, :, some] += matrix
         away = operations.mean[:, which] - mean[:, some]
-        pull[:, some] += operations.vector[:, which] + linalg.matvec(matrix, away)
+        innovation = operations.vector[:, which] + linalg.matvec(matrix, away)
+        pull[:, some] += innovation
+        beside[:, which] = _beside(covariance[:, :, some], matrix, innovation)
     with np.errstate(all="ignore"):
         spread = linalg.inverse(linalg.inverse(covariance) + added)
         moved = mean + linalg.matvec(spread, pull)
@@ -205,6 +212,17 @@ def _updated(
         if len(some):
             _intersect(mean, covariance, some, which, operations, share)
     return replace(states, mean=mean, covariance=covariance)
+
+
+def _beside(covariance: Floats, matrix: Floats, innovation: Floats) -> Floats:
+    with np.errstate(all="ignore"):
+        gain = linalg.product(covariance, matrix)
+        spread = gain + linalg.product(gain, gain)
+        expected = linalg.trace(spread)
+        scale = expected / linalg.trace(linalg.product(spread, spread))
+        found = linalg.total(innovation * linalg.matvec(covariance, innovation))
+        out = np.stack([found * scale, expected * scale])
+        return np.where(np.isfinite(out).all(axis=0) & (out[1] > 0), out, 0.0)
 
 
 def _intersect(

@@ -5,17 +5,21 @@ of all its tracks, summed over some thousands, are compared with their expectati
 bounds, and by more than matters, claims measurements better than they are, or a motion that is not that of its
 tracker: up to `WORST` times too large, its increments are divided by as much; beyond, or too small, its tracks go by
 the rule until the sum is within the bounds again.
+
+The increments are watched beside the filters that take them, too: there they can be too large because of others, or of
+the motion, but too small only if they are not measurements of their own. That shows a tracker that is fed with fused
+tracks and does not say so.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 
-from fusion_service.arrays import Bools, Ints
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.increments import Increments
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.partial import AXES, PLACED
@@ -25,10 +29,10 @@ from schemas import Motion
 
 __all__ = ["INNOVATIONS", "UNTRUE", "WATCHED", "Record", "Watch", "reason_of"]
 
-INNOVATIONS = "innovations"
-WATCHED = ("", INNOVATIONS, "increments", "registration", "covariance_floor")
+INNOVATIONS, DEPENDENT = "innovations", "dependent"
+WATCHED = ("", INNOVATIONS, DEPENDENT, "increments", "registration", "covariance_floor")
 """Reasons, of those whose increments are what the tracker has measured all the same."""
-UNTRUE = (INNOVATIONS, "feedback", "motion")
+UNTRUE = (INNOVATIONS, DEPENDENT, "feedback", "motion")
 """Reasons for which nothing is to be concluded from successive covariances either."""
 REMEMBERED = 2000.0
 """Degrees of freedom that a sum holds about; older ones fade."""
@@ -39,19 +43,24 @@ SIGMAS = 3.3
 MATTERS = 0.15
 """Deviation from 1 that is left alone though it is no chance: trackers of real sensors are never exact."""
 WORST = 2.0
-LEAST = 0.75
+LEAST = 0.6
+FADING = 0.999
+"""Of what was seen of a source that is left out as dependent, kept per step: it is tried again."""
 
 
 @dataclass(slots=True)
 class Record:
     """Of one source, fading: sum and freedom of its innovations, versions, and how many of them were sound and how many
-    taken as tracklets. reason: why its tracks are not taken as tracklets, or ""."""
+    taken as tracklets; beside, beside_freedom: of its increments beside the filters of the targets. reason: why its
+    tracks are not taken as tracklets, or ""."""
 
     sum: float = 0.0
     freedom: float = 0.0
     versions: float = 0.0
     sound: float = 0.0
     taken: float = 0.0
+    beside: float = 0.0
+    beside_freedom: float = 0.0
     reason: str = ""
 
     @property
@@ -75,6 +84,12 @@ class Record:
         """Whether its increments are not to be taken at all."""
         low, high = self.bounds
         return self.ratio > max(high, WORST) or self.ratio < min(low, LEAST)
+
+    @property
+    def dependent(self) -> bool:
+        """Whether its increments agree with the filters better than measurements of its own can."""
+        spread = SIGMAS * math.sqrt(2.0 / max(self.beside_freedom, 1e-9))
+        return self.beside < min(1.0 - spread, LEAST) * self.beside_freedom
 
     @property
     def unsound(self) -> bool:
@@ -106,6 +121,10 @@ class Watch:
                 reason = INNOVATIONS
             elif not reason and record.unsound:
                 reason = "increments"
+            elif not reason and record.dependent:
+                reason = DEPENDENT
+            if reason == DEPENDENT:
+                record.beside, record.beside_freedom = FADING * record.beside, FADING * record.beside_freedom
             if reason != record.reason and (reason or record.versions):
                 changed.append({"kind": "tracklets", "source": name, "why": reason, "ratio": round(record.ratio, 4)})
             record.reason = reason
@@ -118,6 +137,15 @@ class Watch:
             innovation, freedom = (math.fsum(part[mine].tolist()) for part in (found.innovation, found.freedom))
             counts = (int(part[mine].sum()) for part in (mine, found.sound, taken))
             self.records[names[at]].add(innovation, freedom, *counts)
+
+    def add_beside(self, names: tuple[str, ...], source: Ints, beside: Floats) -> None:
+        """Count the innovations (2, K) of increments beside the filters that took them, and their expectations."""
+        for at in np.unique(source).tolist():
+            found, expected = (math.fsum(part[source == at].tolist()) for part in beside)
+            record = self.records[names[at]]
+            kept = min(1.0, REMEMBERED / (record.beside_freedom + expected)) if expected > 0 else 1.0
+            record.beside = kept * (record.beside + found)
+            record.beside_freedom = kept * (record.beside_freedom + expected)
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
@@ -133,8 +161,7 @@ class Watch:
     def packed(self) -> dict[str, list[Any]]:
         """As plain values."""
         return {
-            name: [one.sum, one.freedom, one.versions, one.sound, one.taken, one.reason]
-            for name, one in sorted(self.records.items())
+            name: [getattr(one, field.name) for field in fields(Record)] for name, one in sorted(self.records.items())
         }
 
     def restore(self, packed: dict[str, list[Any]]) -> None:

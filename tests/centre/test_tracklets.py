@@ -280,3 +280,27 @@ def test_a_note_says_in_words_why_there_are_no_tracklets_and_only_where_they_are
         assert sources["b"]["note"].startswith("no tracklets of it: nobody declares") == asked
         assert ("tracklets" in sources["a"]) == asked
         assert sources["a"]["innovation"] > 0
+
+
+def test_feedback_that_is_not_told_is_seen() -> None:
+    """A tracker that goes on from the fused result adds to it what is in it already."""
+    world = World({"a": 8.0, "b": 13.0, "c": 25.0}, targets=40, seed=9)
+    for name in world.filters:
+        world.say(name)
+    errors, stated = [], []
+    for t in range(1, 50):
+        world.move(float(t))
+        world.hear(*(world.look(name) for name in world.filters))
+        picture = world.step(float(t))
+        order = np.argsort(picture.means[:, 0])
+        assert len(order) == len(world.x)
+        fed = world.filters["c"]
+        fed.x, fed.P = picture.means[order].copy(), picture.covariances[order].mean(axis=0)
+        if t > 15:
+            errors.append(picture.means[order] - world.x)
+            stated.append(picture.covariances[order])
+    health = world.result.status.sources
+    assert {name: health[name]["no_tracklets"] for name in "abc"} == {"a": "", "b": "", "c": "dependent"}
+    e, P = np.concatenate(errors), np.concatenate(stated)
+    nees = np.einsum("bi,bij,bj->b", e, np.linalg.inv(P), e).mean() / 4
+    assert 0.8 < nees < 1.15, "1.6 where it is taken for a tracker of its own"

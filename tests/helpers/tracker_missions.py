@@ -1,4 +1,4 @@
-"""Missions of real trackers, drawn from a seed: with all that a source may declare or do that decides whether its tracks
+"""Missions of real trackers from a seed: with all that a source may declare or do that decides whether its tracks
 are taken as tracklets, and whether their correlation is derived. Flown and made again as `random_missions` are."""
 
 from __future__ import annotations
