@@ -14,7 +14,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-RULES = (("naive", None), ("ci", "det"), ("ci", "trace"), ("hmd-ga", "det"))
+RULES = (("auto", None), ("naive", None), ("ci", "det"), ("ci", "trace"), ("hmd-ga", "det"))
 SCENARIOS = (2, 3, 5, 13, 16)
 TO_BEAT = {"2": 8.8, "3": 21.6, "5": 16.8, "13": 15.0, "16": 16.8, "mean": 15.8}
 """A centralised JPDA tracker on the same returns, tuned on these five (Stone Soup)."""

@@ -35,6 +35,8 @@ from studies.missions import Told, fuse, told, truths
 
 CUTOFF = 1.0
 CONFIGS = (
+    'rule = "auto"',
+    'rule = "auto"\nrule_options = {max_correlation = {within = 1.0, between = 0.5}}',
     'rule = "ci"',
     'rule = "naive"',
     'rule = "bci"\nrule_options = {max_correlation = 0.25}',
