@@ -40,7 +40,7 @@ def confirmed(tracks: GlobalTracks) -> Picture:
 
 def fly(world: World) -> Flight:
     """All steps of a world: each at t with all that was received up to t and the delay, as the running service does."""
-    centre = FusionCentre(world.config)
+    centre = FusionCentre({"rule": "ci", **world.config})  # of the floor too, which knows no other road
     for name in world.sources:
         centre.handle(SourceFound(name), int(world.times[0]) - SECOND)
     targets = world.truth.shape[1]
