@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.arrays import Bools, Floats, Ints
-from fusion_service.centre.derived import Followed
+from fusion_service.centre.derived import MOST_MEMBERS, Followed
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import WAYS
 from fusion_service.centre.rows import Rows
@@ -83,14 +83,16 @@ class Correlation:
         self, rows: Rows, members: Ints, means: Floats, covariances: Floats, some: Ints, options: dict[str, Any]
     ) -> tuple[Fused, Ways]:
         """By the cross-covariances where all of a target are known; else under the bounds, those derived and those
-        declared; else by `ci`."""
+        declared; else by `ci`. Of more than `MOST_MEMBERS` rows not all pairs are followed, and nothing is derived."""
         size, N = members.shape
-        n = means.shape[1]
         few = {name: value for name, value in options.items() if name not in ("max_correlation", "cross")}
-        R, C, unknown = np.ones((N, N, size)), np.zeros((N, N, n, n, size)), np.ones(size)
-        if self.followed is not None and N > 1:
-            R, C, unknown = self.followed.of(members)
-            C = C[:, :, some][:, :, :, some]
+        followed = self.followed if 1 < N <= MOST_MEMBERS else None
+        if followed is None and self.groups is None:
+            return fuse_last("ci", means, covariances, influence=True, **few), np.full(size, BY_CI, dtype=np.uint8)
+        R, C, unknown = np.ones((N, N, size)), None, np.ones(size)
+        if followed is not None:
+            R, whole, unknown = followed.of(members)
+            C = whole[:, :, some][:, :, :, some]
         derived = (R < 1.0).any(axis=(0, 1))
         R = np.minimum(R, self._between(rows, members))
         bounded = (R < 1.0).any(axis=(0, 1))

@@ -36,7 +36,7 @@ from fusion_service.centre.association import by_size
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.shared_noise import SharedNoise
 
-__all__ = ["Derived", "Followed", "Successive"]
+__all__ = ["MOST_MEMBERS", "Derived", "Followed", "Successive"]
 
 MOST_PAIRS = 200_000
 """Pairs that are followed at most."""

@@ -76,7 +76,8 @@ class FusionCentre(Centre):
         self._relink(dict.fromkeys(tracks, 0))
 
     def _relink(self, new: dict[int, int]) -> None:
-        """Change the links of all tables: {old global id: new one, or 0}."""
+        """Change the links of all tables: {old global id: new one, or 0}. A source has one track in a global one: of a
+        source that is not heard now the others are linked to none."""
         if not new:
             return
         old = np.array(sorted(new), dtype=np.uint64)
@@ -85,6 +86,9 @@ class FusionCentre(Centre):
             at = np.flatnonzero(np.isin(source.tracks.link, old))
             if len(at):
                 link = to[np.searchsorted(old, source.tracks.link[at])]
+                double = np.isin(link, np.delete(source.tracks.link, at))
+                double |= ~np.isin(np.arange(len(at)), np.unique(link, return_index=True)[1])
+                link = np.where(double, NO_TRACK, link)
                 source.tracks = relinked(source.tracks, at, link, self._step)
 
     def _associate(self, rows: Rows, names: tuple[str, ...], time: int) -> Picture:

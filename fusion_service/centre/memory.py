@@ -25,7 +25,7 @@ from fusion_service.centre.lifecycle import WAYS, Picture
 from fusion_service.centre.motions import Motions, States
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.shared_noise import SharedNoise
-from fusion_service.centre.tracklets import Filters, Operations, run
+from fusion_service.centre.tracklets import Filters, Operations, closed, run
 from fusion_service.centre.versions import Versions, versions_of
 from fusion_service.centre.watch import UNTRUE, WATCHED, Watch
 from schemas import Entry
@@ -67,15 +67,15 @@ class Memory:
                 journal.event(event)
         versions = versions_of(self._intake, rows)
         found = increments(versions)
-        followed = self._followed(rows, names, versions, time, journal)
+        at = np.where(rows.inside_mask(), now.find(rows.tracks.link), -1)
+        capable = self._capable(rows, names)
+        filtered = np.append(self._filtered(now, before, at, capable), False)
+        followed = self._followed(rows, names, versions, ~filtered[at], time, journal)
         known = declared_correlation(self._intake, self._config, followed)
         if not self._config.by_tracklets:
             picture, influence = fuse_all(rows, now, time, known, journal)
             self._note(rows, names, versions.row, found, np.zeros(len(versions.row), dtype=np.bool_))
             return self._moving(rows, names, picture), influence
-        at = np.where(rows.inside_mask(), now.find(rows.tracks.link), -1)
-        capable = self._capable(rows, names)
-        filtered = np.append(self._filtered(now, before, at, capable), False)
         picture, influence = fuse_all(rows, now, time, known, journal, filtered[at])
         ruled = np.zeros(len(now.id) + 1, dtype=np.bool_)
         ruled[at[~filtered[at]]] = True
@@ -91,7 +91,8 @@ class Memory:
         able = np.bincount(at[fed & capable], minlength=count)
         other = np.bincount(at[fed & ~capable], minlength=count)
         held = np.isin(now.id, self.filters.id)
-        return np.asarray(((able > 1) | (held & (able > 0) & (other == 0))) & (before.time >= 0))
+        begun = (before.time >= 0) & self._config.by_tracklets
+        return np.asarray(((able > 1) | (held & (able > 0) & (other == 0))) & begun)
 
     def _moving(self, rows: Rows, names: tuple[str, ...], picture: Picture) -> Picture:
         """The picture, its tracks moving as the sources that feed them declare."""
@@ -102,15 +103,16 @@ class Memory:
         return replace(picture, motion=self.motions.follow(picture, at, declared, rows.source[inside]))
 
     def _followed(
-        self, rows: Rows, names: tuple[str, ...], versions: Versions, time: int, journal: Journal
+        self, rows: Rows, names: tuple[str, ...], versions: Versions, ruled: Bools, time: int, journal: Journal
     ) -> Followed | None:
-        """What successive covariances tell of the correlation of rows; by rule auto not of those whose own innovations
-        speak against what they say."""
+        """What successive covariances tell of the correlation of rows that go by the rule, `ruled` (M,); by rule auto
+        not of those whose own innovations speak against what they say."""
         if not self._config.by_derived:
             return None
         chosen = self._config.rule != AUTO
         trusted = [chosen or self.watch.records[name].reason not in UNTRUE for name in names]
-        sound = sound_rows(rows) & np.array(trusted, dtype=np.bool_)[rows.source] & kinship.alone(self._intake, rows)
+        sound = ruled & sound_rows(rows) & kinship.alone(self._intake, rows)
+        sound &= np.array(trusted, dtype=np.bool_)[rows.source]
         noise = SharedNoise(declared_motions(self._intake), self._config.space)
         followed = self.derived.follow(rows, names, versions, noise, sound, time)
         if self.derived.beyond:
@@ -144,8 +146,8 @@ class Memory:
         kept = np.isin(self.filters.pending.track, picture.id[filtered[:-1]])
         operations = self.filters.pending.take(kept).join(new, _whole(rows, np.flatnonzero(whole), time))
         some = np.flatnonzero(filtered[:-1])
-        cut = self._cut(rows, names, at, len(picture.id), time)[some]
         which = np.searchsorted(picture.id[some], operations.track)
+        cut = closed(self._cut(rows, names, at, len(picture.id), time)[some], which, operations.time)
         states, bases, share, beside = run(base.take(some), which, operations, cut, time, self.motions)
         fresh = operations.row >= 0
         np.add.at(influence, operations.row[fresh], share[fresh])

@@ -24,21 +24,21 @@ class SharedNoise:
 
     def __init__(self, motions: Sequence[Motion | None], space: tuple[str, ...]) -> None:
         self._space = space
-        self._kinds: list[Motion] = []
+        numbers: dict[Motion, int] = {}
         self.kind = np.full(len(motions), -1, dtype=np.intp)
         """(S,): number of the motion of each source, -1: none that anything follows from."""
         for i, motion in enumerate(motions):
             if motion is None:
                 continue
-            if motion not in self._kinds:
-                self._kinds.append(motion)
-            self.kind[i] = self._kinds.index(motion)
+            self.kind[i] = numbers.setdefault(motion, len(numbers))
+        self._kinds = list(numbers)
         linear = np.array([self._is_linear(motion) for motion in self._kinds], dtype=np.bool_)
         if len(linear):
             self.kind = np.where((self.kind >= 0) & linear[self.kind], self.kind, -1)
-        self._shared = np.array(
-            [[self._of_two(i, j) for j in range(len(self._kinds))] for i in range(len(self._kinds))], dtype=np.intp
-        ).reshape(len(self._kinds), len(self._kinds))
+        moves, noise = self._of_a_second()
+        louder = noise[:, None] >= noise[None]
+        number = np.arange(len(self._kinds))
+        self._shared = np.where(moves[:, None] == moves[None], np.where(louder, number[:, None], number[None]), -1)
 
     def of(self, first: Ints, second: Ints) -> Ints:
         """The motion (K,) that sources `first` and `second` share, -1: none."""
@@ -74,8 +74,12 @@ class SharedNoise:
         moved = predict(motion, self._space, state, np.zeros((n, n, 1)), second)[0]
         return bool(np.allclose(F[:, :, 0] @ state, moved - start))
 
-    def _of_two(self, i: int, j: int) -> int:
-        (F, Q), (G, R) = (self._transition(self._kinds[k], np.ones(1)) for k in (i, j))
-        if not np.array_equal(F, G):
-            return -1
-        return i if np.trace(Q[:, :, 0]) >= np.trace(R[:, :, 0]) else j
+    def _of_a_second(self) -> tuple[Ints, Floats]:
+        """Of each motion which F (K,) it has, those that are equal by the same number, and trace Q (K,)."""
+        known: dict[bytes, int] = {}
+        moves, noise = [], []
+        for motion in self._kinds:
+            F, Q = self._transition(motion, np.ones(1))
+            moves.append(known.setdefault((F + 0.0).tobytes(), len(known)))
+            noise.append(float(np.trace(Q[:, :, 0])))
+        return np.array(moves, dtype=np.intp), np.array(noise)

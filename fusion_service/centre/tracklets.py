@@ -25,7 +25,10 @@ from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.motions import Motions, States
 from fusion_service.rules import fuse_last
 
-__all__ = ["Filters", "Operations", "run"]
+__all__ = ["Filters", "Operations", "closed", "run"]
+
+MOST_OPEN = 256
+"""Operations of a filter that are done again in the next step, at most: beyond, the time of the oldest is closed."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,6 +131,15 @@ class Filters:
         """A new era begins at `time`, ns: nothing is later."""
         np.minimum(self.base.time, time, out=self.base.time)
         np.minimum(self.pending.time, time, out=self.pending.time)
+
+
+def closed(cut: NDArray[np.int64], at: Ints, times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Up to when (G,) nothing more is waited for: `cut`, or later where too much would be done again. at (K,): the
+    state of each operation, in order of (at, `times` (K,))."""
+    beyond = np.cumsum(np.bincount(at, minlength=len(cut))) - MOST_OPEN - 1
+    cut, many = cut.copy(), np.bincount(at, minlength=len(cut)) > MOST_OPEN
+    cut[many] = np.maximum(cut[many], times[beyond[many]])
+    return cut
 
 
 def run(

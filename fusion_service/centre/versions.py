@@ -23,8 +23,8 @@ from schemas import Motion
 
 __all__ = ["Versions", "versions_of"]
 
-MOST_MOTIONS = 16
-"""Motions that one source may declare between two steps."""
+MOST_VERSIONS = 64
+"""Of one row in a step; where there are more, several in a row are taken as one."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,12 +77,27 @@ def _versions(
     old, new = (join_tracks([pair[side] for pair in pairs]) for side in (0, 1))
     at = np.minimum(np.searchsorted(ids, new.id), len(ids) - 1)
     known = ids[at] == new.id
-    old, new, at = _as_said(old.take(known), inflation), _as_said(new.take(known), inflation), at[known]
+    old, new, at = _thinned(old.take(known), new.take(known), at[known])
+    old, new = _as_said(old, inflation), _as_said(new, inflation)
     wanted = intake.config.space
     gone, speed = (new.time - old.time) / 1e9, intake.config.unknown_speed
     predicted = predict_tracks(old, motion, space, wanted, gone, intake.frame, speed)
     now = predict_tracks(new, motion, space, wanted, np.zeros(len(new.time)), intake.frame)
     return Versions(at + start, new.time, old.time, predicted.mean, predicted.covariance, now.mean, now.covariance)
+
+
+def _thinned(old: Tracks, new: Tracks, at: Any) -> tuple[Tracks, Tracks, Any]:
+    """At most `MOST_VERSIONS` of each row `at` (K,): the old version of the first of some in a row, and the new one of
+    the last. What is between two of them is process noise over a small part of a step."""
+    if not len(at) or np.bincount(at).max() <= MOST_VERSIONS:
+        return old, new, at
+    order = np.lexsort((new.time, at))
+    row = at[order]
+    begin, end = np.searchsorted(row, row, "left"), np.searchsorted(row, row, "right")
+    part = (np.arange(len(row)) - begin) * np.minimum(MOST_VERSIONS, end - begin) // (end - begin)
+    first = np.append(True, (row[1:] != row[:-1]) | (part[1:] != part[:-1]))
+    last = np.append(first[1:], True)
+    return old.take(order[first]), new.take(order[last]), row[last]
 
 
 def _as_said(tracks: Tracks, inflation: float) -> Tracks:
