@@ -23,6 +23,7 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import WAYS, Picture
 from fusion_service.centre.motions import Motions, States
+from fusion_service.centre.partial import AXES, PLACED, Unknown
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.shared_noise import SharedNoise
 from fusion_service.centre.tracklets import Filters, Operations, closed, run
@@ -124,7 +125,18 @@ class Memory:
         sources = np.array([not self.watch.records[name].reason for name in names], dtype=np.bool_)
         parts = rows.tracks.log_weight
         several = np.isfinite(parts).sum(axis=0) > 1 if len(parts) else np.zeros(len(rows.source), dtype=np.bool_)
-        return sources[rows.source] & ~several & kinship.alone(self._intake, rows)
+        return sources[rows.source] & ~several & ~self._unseen(rows, names) & kinship.alone(self._intake, rows)
+
+    def _unseen(self, rows: Rows, names: tuple[str, ...]) -> Bools:
+        """Rows (M,) of a place whose velocity is not known, as of a source that does not tell it (see `watch`)."""
+        space, covariance = self._config.space, rows.tracks.covariance
+        known = Unknown.of(space).known(covariance)
+        unseen = np.zeros(len(rows.source), dtype=np.bool_)
+        for place, speed in AXES:
+            if place in space and speed in space:
+                unseen |= known[space.index(place)] & ~known[space.index(speed)]
+        said = (self._intake.declared(self._intake.sources[name]).motion.kind for name in names)
+        return unseen & ~np.array([kind in PLACED for kind in said], dtype=np.bool_)[rows.source]
 
     def _filter(
         self, rows: Rows, names: tuple[str, ...], before: Picture, picture: Picture, influence: Floats, at: Ints,

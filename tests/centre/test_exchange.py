@@ -45,7 +45,7 @@ def test_every_centre_is_honest_and_no_worse_than_alone(graph: str, steps: int) 
     for name, score in together.items():
         assert score.rmse <= 1.02 * alone[name].rmse, name
     if graph == "tree":
-        assert together["top"].rmse < 0.8 * min(together["A"].rmse, together["B"].rmse)
+        assert together["top"].rmse < 0.9 * min(together["A"].rmse, together["B"].rmse)
     else:
         assert together["A"].rmse < 0.75 * alone["A"].rmse, "it hears nothing"
 

@@ -104,7 +104,7 @@ def test_a_ship_at_anchor_and_a_ferry_by_one_receiver(period: float) -> None:
 
 
 def test_a_fast_source_on_a_slow_link_has_its_tracks() -> None:
-    made = centre((), lateness=5.0)
+    made = centre((), lateness=5.0, rule="ci")
     made.handle(info("fast", period=0.1), START)
     results = []
     for k in range(1, 200):
@@ -149,7 +149,7 @@ def test_what_is_stale_on_arrival_is_told_and_counted() -> None:
 
 
 def test_tracks_that_wait_for_info_or_for_a_later_step_are_told() -> None:
-    made = FusionCentre({"max_future": 60.0})
+    made = FusionCentre({"max_future": 60.0, "rule": "ci"})
     report(made, "unknown", 1, [1, 2])
     made.handle(info("ahead"), START)
     report(made, "ahead", 5, [1], late=-4.0)
