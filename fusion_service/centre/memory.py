@@ -75,7 +75,8 @@ class Memory:
         known = declared_correlation(self._intake, self._config, followed)
         if not self._config.by_tracklets:
             picture, influence = fuse_all(rows, now, time, known, journal)
-            self._note(rows, names, versions.row, found, np.zeros(len(versions.row), dtype=np.bool_))
+            none = np.zeros(len(versions.row), dtype=np.bool_)
+            self._note(rows, names, versions.row, (at >= 0) & (rows.tracks.since < step), found, none)
             return self._moving(rows, names, picture), influence
         picture, influence = fuse_all(rows, now, time, known, journal, filtered[at])
         ruled = np.zeros(len(now.id) + 1, dtype=np.bool_)
@@ -146,14 +147,15 @@ class Memory:
         tracks = rows.tracks
         self.filters.rename(names)
         base = self.filters.bases(before)
-        settled = filtered[at] & (tracks.since < step)
+        stays = (at >= 0) & (tracks.since < step)
+        settled = filtered[at] & stays
         row = versions.row
         good = found.sound & (capable & settled)[row] & (versions.time >= np.append(base.time, 0)[at[row]])
         spoiled = np.zeros(len(at), dtype=np.bool_)
         spoiled[row[~good]] = True
         good &= ~spoiled[row]
         whole = filtered[at] & (tracks.time > tracks.used) & (spoiled | ~capable | ~settled)
-        self._note(rows, names, row, found, good)
+        self._note(rows, names, row, stays, found, good)
         new = self._as_operations(rows, names, versions, found, np.flatnonzero(good))
         kept = np.isin(self.filters.pending.track, picture.id[filtered[:-1]])
         operations = self.filters.pending.take(kept).join(new, _whole(rows, np.flatnonzero(whole), time))
@@ -178,10 +180,13 @@ class Memory:
         picture = replace(picture, mean=mean, covariance=covariance, time=when, lineage=lineage, way=way)
         return with_parts(picture, some, [])
 
-    def _note(self, rows: Rows, names: tuple[str, ...], row: Ints, found: Increments, taken: Bools) -> None:
-        """Let the watch see the versions that count: of sources that declare what it takes, and Gaussian."""
+    def _note(
+        self, rows: Rows, names: tuple[str, ...], row: Ints, stays: Bools, found: Increments, taken: Bools
+    ) -> None:
+        """Let the watch see the versions that count: of sources that declare what it takes, Gaussian, and of rows that
+        stay (M,) in their track: a jump out of it is an id that went over to another object."""
         watched = [self.watch.records[name].reason in WATCHED for name in names]
-        mine = np.array(watched, dtype=np.bool_)[rows.source[row]]
+        mine = np.array(watched, dtype=np.bool_)[rows.source[row]] & stays[row]
         parts = rows.tracks.log_weight
         if len(parts):
             mine &= np.isfinite(parts[:, row]).sum(axis=0) <= 1

@@ -38,8 +38,9 @@ REMEMBERED = 2000.0
 """Degrees of freedom that a sum holds about; older ones fade."""
 FEW = 20
 """Versions before their soundness is judged."""
-SIGMAS = 3.3
-"""Of a sum's own spread, beyond which it is not by chance (1 in 1,000, two-sided)."""
+SIGMAS = 4.0
+"""Of a sum's own spread, beyond which it is not by chance. It is looked at in every step: of honest sources with one
+track 1 in 500 is found beyond once in an hour of steps."""
 MATTERS = 0.15
 """Deviation from 1 that is left alone though it is no chance: trackers of real sensors are never exact."""
 WORST = 2.0
@@ -70,9 +71,11 @@ class Record:
 
     @property
     def bounds(self) -> tuple[float, float]:
-        """What the ratio lies within by chance, or without mattering."""
-        spread = max(SIGMAS * math.sqrt(2.0 / max(self.freedom, 1e-9)), MATTERS)
-        return max(1.0 - spread, 0.0), 1.0 + spread
+        """What the ratio lies within by chance (Wilson, Hilferty 1931: the cube root of a mean of squares is nearly
+        Gaussian), or without mattering."""
+        part = 2.0 / (9.0 * max(self.freedom, 1.0))
+        low, high = ((max(1.0 - part + side * SIGMAS * math.sqrt(part), 0.0)) ** 3 for side in (-1, 1))
+        return min(low, 1.0 - MATTERS), max(high, 1.0 + MATTERS)
 
     @property
     def inflation(self) -> float:
