@@ -144,7 +144,7 @@ class Derived:
         shared = noise.of(*rows.source[pair])
         pairs, known = self._carried(rows, names, pair)
         broken = self._apply(pairs, pair, versions, noise, shared, np.flatnonzero(known)) | ~known
-        W = _whitening(rows.tracks.covariance)
+        W = _whitening(rows.tracks.covariance) if pair.size else rows.tracks.covariance
         at = np.flatnonzero(broken)
         pairs.time[at], pairs.version[:, at], pairs.cross[:, :, at] = time, rows.tracks.time[pair[:, at]], 0.0
         for side in (0, 1):

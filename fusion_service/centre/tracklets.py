@@ -231,7 +231,7 @@ def _beside(covariance: Floats, matrix: Floats, innovation: Floats) -> Floats:
         gain = linalg.product(covariance, matrix)
         spread = gain + linalg.product(gain, gain)
         expected = linalg.trace(spread)
-        scale = expected / linalg.trace(linalg.product(spread, spread))
+        scale = expected / linalg.total(linalg.total(spread * spread.swapaxes(0, 1)))
         found = linalg.total(innovation * linalg.matvec(covariance, innovation))
         out = np.stack([found * scale, expected * scale])
         return np.where(np.isfinite(out).all(axis=0) & (out[1] > 0), out, 0.0)

@@ -46,7 +46,7 @@ def settings(rng: np.random.Generator) -> CentreConfig:
     rule = {"rule": "auto"} if way == 0 else one(*DERIVED[:2]) if way == 1 else one(*DERIVED)
     table: dict[str, Any] = {
         **rule,
-        "memory": "tracklet" if way > 1 else one("restart", "tracklet") if way == 0 else "restart",
+        "memory": "tracklet" if way > 1 else one("restart", "tracklet", "auto") if way == 0 else "restart",
         "space": list(one(SPACE, SPACE, SPACE, *SPACES[1:])),
         "lateness": one(0.0, 2.0, 5.0),
         "coast": one(2.0, 8.0),
