@@ -94,7 +94,7 @@ def trackers(speed: float) -> None:
     cases = (
         ("Gaussians", "`ci`", ["--rule", "ci"]),
         ("IMM mixtures", "`gm-ga`", ["--tracker", "imm", "--set", "mixture_rule=gm-ga"]),
-        ("IMM mixtures", "`ci` on moments", ["--tracker", "imm"]),
+        ("IMM mixtures", "`auto` on moments", ["--tracker", "imm"]),
         ("intensities", "`hybrid`", ["--tracker", "gm-phd"]),
         ("intensities", "`aa`", ["--tracker", "gm-phd", "--set", "intensity_rule=aa"]),
         ("intensities", "`ga`", ["--tracker", "gm-phd", "--set", "intensity_rule=ga"]),
