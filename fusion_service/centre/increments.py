@@ -33,6 +33,8 @@ process noise that is declared a tenth too small."""
 RIDGE = 0.05
 """Of P_-, added to P_- - P, which has the rank of the measurement only: directions in which less than that is gained
 count for little, so that a process noise declared a tenth too large does not count as freedom."""
+LITTLE = 0.5
+"""An innovation of less freedom says nothing."""
 LARGEST = 50.0
 """No innovation counts for more, per degree of freedom: one of a manoeuvre says little of all the others."""
 
@@ -71,6 +73,7 @@ def increments(versions: Versions) -> Increments:
         sound &= np.isfinite(information).all(axis=(0, 1))
         sound &= linalg.is_positive_definite(information + NEGATIVE * old)
         judged = np.isfinite(innovation) & np.isfinite(freedom) & linalg.is_positive_definite(ridged)
+        counted = judged & (freedom > LITTLE)
     return Increments(
-        information, vector, np.where(judged, innovation, 0.0), np.where(judged, freedom, 0.0), sound & judged
+        information, vector, np.where(counted, innovation, 0.0), np.where(counted, freedom, 0.0), sound & judged
     )

@@ -53,7 +53,7 @@ WORLD = World(SENSORS)
 MAIN = ("ci", "naive", "bci:max_correlation=0.5", "fast-ci")
 OTHERS = ("ffcc", "ici", "ei", "hmd-ga", "aa", "cu")
 LEARNT: tuple[Way, ...] = (
-    ("auto restart", {"rule": "auto"}),
+    ("auto", {"rule": "auto"}),
     ("bar-shalom-campo:derived restart", {"rule": "bar-shalom-campo", "rule_options": {"cross": "derived"}}),
     ("bci:derived restart", {"rule": "bci", "rule_options": {"max_correlation": "derived"}}),
 )

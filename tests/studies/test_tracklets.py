@@ -157,7 +157,7 @@ def test_tracklets_are_the_centralised_filter_and_the_rule_is_the_best_sensor() 
     assert share > 99.9
     assert abs(seen - 1) < 0.15
     assert flight.scores["ci restart"].rmse().value == pytest.approx(best.rmse().value, rel=1e-3)
-    assert flight.scores["auto restart"].rmse().value == pytest.approx(whole.rmse().value, rel=1e-3)
+    assert flight.scores["auto"].rmse().value == pytest.approx(whole.rmse().value, rel=1e-3)
     assert best.rmse().value > 1.15 * ours.rmse().value
     naive = flight.scores["naive restart"].worst()
     assert abs(naive.value - 2.631) < 5 * naive.stderr
