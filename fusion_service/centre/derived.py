@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, to_bytes
 from fusion_service.centre.association import by_size
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.shared_noise import SharedNoise
@@ -257,7 +257,7 @@ class Derived:
         return {
             "n": self.n,
             "names": list(self.names),
-            "columns": [_bytes(column) for column in (*columns, held.astype(np.int64), pairs.left[..., held])],
+            "columns": [to_bytes(column) for column in (*columns, held.astype(np.int64), pairs.left[..., held])],
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -281,10 +281,6 @@ class Derived:
             cross.reshape(n, n, K).astype(np.float64),
             whole,
         )
-
-
-def _bytes(array: NDArray[Any]) -> bytes:
-    return np.ascontiguousarray(array, array.dtype.newbyteorder("<")).tobytes()
 
 
 def _rows_of(rows: Rows, source: Ints, epoch: NDArray[np.uint64], ids: NDArray[np.uint64]) -> Ints:

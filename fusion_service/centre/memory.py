@@ -1,7 +1,7 @@
 """What a centre remembers of its targets beside the picture, and which rows take part in it in which way.
 
-With `memory = "tracklet"` a global track that a capable row feeds goes by the filter of the target (`tracklets`); every
-other one by the rule of the config, from the rows of the step alone.
+With `memory = "tracklet"` a global track that two capable rows feed goes by the filter of the target (`tracklets`), and
+with one of them alone it stays there; every other one goes by the rule of the config, from the rows of the step alone.
 """
 
 from __future__ import annotations
@@ -124,9 +124,7 @@ class Memory:
     def _capable(self, rows: Rows, names: tuple[str, ...]) -> Bools:
         """Rows (M,) whose versions may be taken as tracklets."""
         sources = np.array([not self.watch.records[name].reason for name in names], dtype=np.bool_)
-        parts = rows.tracks.log_weight
-        several = np.isfinite(parts).sum(axis=0) > 1 if len(parts) else np.zeros(len(rows.source), dtype=np.bool_)
-        return sources[rows.source] & ~several & ~self._unseen(rows, names) & kinship.alone(self._intake, rows)
+        return sources[rows.source] & sound_rows(rows) & ~self._unseen(rows, names) & kinship.alone(self._intake, rows)
 
     def _unseen(self, rows: Rows, names: tuple[str, ...]) -> Bools:
         """Rows (M,) of a place whose velocity is not known, as of a source that does not tell it (see `watch`)."""
@@ -186,10 +184,7 @@ class Memory:
         """Let the watch see the versions that count: of sources that declare what it takes, Gaussian, and of rows that
         stay (M,) in their track: a jump out of it is an id that went over to another object."""
         watched = [self.watch.records[name].reason in WATCHED for name in names]
-        mine = np.array(watched, dtype=np.bool_)[rows.source[row]] & stays[row]
-        parts = rows.tracks.log_weight
-        if len(parts):
-            mine &= np.isfinite(parts[:, row]).sum(axis=0) <= 1
+        mine = (np.array(watched, dtype=np.bool_)[rows.source] & stays & sound_rows(rows))[row]
         self.watch.add(names, rows.source[row][mine], found.take(mine), taken[mine])
 
     def _as_operations(

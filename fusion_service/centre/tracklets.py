@@ -1,10 +1,10 @@
 """`memory = "tracklet"`: a filter of the target's own that takes what successive versions of its local tracks add.
 
-Each global track that a capable row feeds has a filter, which begins with what the rule made of its rows at birth. A
-version of a capable row is an equivalent measurement (`increments`) at its own time. What is no such measurement
-enters as a whole, by covariance intersection with the filter at the step: a row that has just joined, a version whose
-increment is not sound or comes too late, every new version of a row that is not capable. That is conservative
-whatever it shares with the filter, and what comes after is independent of it again.
+Each global track that capable rows feed (`memory` says which) has a filter, which begins with what the rule made of
+its rows at birth. A version of a capable row is an equivalent measurement (`increments`) at its own time. What is no
+such measurement enters as a whole, by covariance intersection with the filter at the step: a row that has just joined,
+a version whose increment is not sound or comes too late, every new version of a row that is not capable. That is
+conservative whatever it shares with the filter, and what comes after is independent of it again.
 
 Operations are done in order of their time, not of their arrival. A source whose messages come after the step that
 they belong to (`Source.lag`) is waited for: the filter is kept as it was before the time that is still open (`base`),
