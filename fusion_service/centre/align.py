@@ -19,6 +19,7 @@ from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
 from fusion_service.centre.stated_registration import shift_of
+from fusion_service.centre.treatment import treated
 from fusion_service.densities import Mixtures
 from schemas import Entry, Frame, Motion
 
@@ -37,6 +38,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     starts: list[NDArray[np.bool_]] = []
     interval: list[NDArray[np.int64]] = []
     lost: list[NDArray[np.bool_]] = []
+    out: list[NDArray[np.bool_]] = []
     gates: list[NDArray[np.float64]] = []
     kept: dict[str, int] = {}
     room = MAX_TOTAL // max(len(intake.sources), 1)
@@ -46,12 +48,13 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         if source.muted or not intake.ready(source):
             leave_out(source)
             continue
-        age = (time - table.time) / 1e9
+        treatment = intake.treatment(name)
+        age = np.maximum(time - table.time + treatment.clock, 0) / 1e9
         predicted = predict_tracks(
             table, said.motion, source.space, config.space, age, intake.frame, config.unknown_speed
         )
         if config.kind == "tracks":
-            predicted = _shifted(predicted, shift_of(intake, source))
+            predicted = _shifted(treated(predicted, config.space, treatment), shift_of(intake, source))
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
@@ -61,7 +64,8 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         parts.append(predicted.take(sound))
         index.append(np.full(count, number, dtype=np.intp))
         epochs.append(np.full(count, max(source.epoch, 0), dtype=np.uint64))  # -1: nothing was heard of it yet
-        starts.append(np.full(count, said.may_start, dtype=np.bool_))
+        starts.append(np.full(count, said.may_start and not treatment.out, dtype=np.bool_))
+        out.append(np.full(count, treatment.out, dtype=np.bool_))
         interval.append(table.interval[sound])
         lost.append(np.full(count, source.alive is False, dtype=np.bool_))
         gate = config.gate if said.gate is None else said.gate
@@ -82,6 +86,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         fresh=tracks.updated > tracks.judged,
         kept=kept,
         kin=kin,
+        out=_joined(out, np.bool_),
     )
 
 

@@ -20,6 +20,7 @@ from fusion_service.centre.memory import Memory
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import relinked
+from fusion_service.centre.supervision import Supervisor
 from fusion_service.config import CentreConfig
 
 __all__ = ["FusionCentre"]
@@ -41,25 +42,34 @@ class FusionCentre(Centre):
         self._linker = Linker(self.config, self._ids)
         self._entries = Entries()
         self._memory = Memory(self._intake)
+        self._supervisor = Supervisor(self._intake)
         self._last = -1
 
     def _kept(self) -> dict[str, Any]:
-        return {**self._linker.packed(), "entries": self._entries.packed(), "memory": self._memory.packed()}
+        return {
+            **self._linker.packed(),
+            "entries": self._entries.packed(),
+            "memory": self._memory.packed(),
+            "supervision": self._supervisor.packed(),
+        }
 
     def _restore(self, state: dict[str, Any]) -> None:
         self._linker.restore(state)
         self._entries = Entries.unpacked(state["entries"])
         if "memory" in state:
             self._memory.restore(state["memory"])
+        self._supervisor.restore(state.get("supervision", {}))
         self._last = self._time
 
     def _rebase(self, time: int) -> None:
         self._linker.merges.rebase(time)
         self._memory.rebase(time)
+        self._supervisor.rebase(time)
         self._last = min(self._last, time)
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         now = self._associate(rows, names, time)
+        self._supervisor.observe(rows, names, now, self._step, time, self._journal)
         self._picture, influence = self._memory.fuse(rows, names, self._picture, now, self._step, time, self._journal)
         self._live(rows, time)
         write_back(rows, self._intake)
@@ -69,7 +79,8 @@ class FusionCentre(Centre):
         watch, wanted = self._memory.watch, self.config.by_tracklets
         return {
             name: {key: value for key, value in watch.health(name).items() if wanted or "tracklets" not in key}
-            for name in watch.records
+            | self._supervisor.health(name)
+            for name in self._intake.names()
         }
 
     def _forget(self, tracks: Iterable[int]) -> None:

@@ -31,6 +31,7 @@ from fusion_service.centre.orders import Orders
 from fusion_service.centre.pictures import as_scan, is_own, is_picture_of, source_of
 from fusion_service.centre.scans import Scan, as_tracks, fits, is_sound, message_tracks, size_of
 from fusion_service.centre.sources import Source, Tracks, empty_tracks
+from fusion_service.centre.treatment import AS_IT_IS, Treatment
 from fusion_service.centre.words import Lexicon, Words
 from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.geodesy import FrameError
@@ -82,6 +83,7 @@ class Intake:
         self.orders = Orders()
         self.said = Lexicon(Words(), Words())
         self.lineages = Lineages()
+        self.treatments: dict[str, Treatment] = {}
         self._given: list[Order] = []
         self._present: dict[str, bool] = {}
         self._refused: Counter[tuple[str, str, bool]] = Counter()
@@ -149,6 +151,10 @@ class Intake:
         """Its info with coverage, detection probability and initiation delay as declared; None while it has none."""
         return sensor_of(self.declared(source), source.info)
 
+    def treatment(self, name: str) -> Treatment:
+        """How the tracks of a source are treated in this step."""
+        return self.treatments.get(name, AS_IT_IS)
+
     def pace(self, source: Source, complete: bool) -> Pace:
         """Bounds of the intervals of its tracks, that come in a complete scan or not."""
         said = self.declared(source)
@@ -208,7 +214,8 @@ class Intake:
         for event, received in queue:
             name = source_of(event)
             timed = isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks))
-            if timed and time < getattr(event, "time", -1) <= horizon(received, self.config):
+            clock = self.treatment(name).clock
+            if timed and time + clock < getattr(event, "time", -1) <= horizon(received, self.config):
                 self._held[name] += 1
                 self._components += size_of(event)
                 self._queue.append((event, received))

@@ -25,7 +25,7 @@ class Rows:
     interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. gate (n + 1,
     M): d2 within which it may join or begin a track, by how many components are in common. fresh (M,): a measurement
     is in it that was not judged before. kept: how many of them each source has, in order. kin: whose data is in each,
-    None where that is not known.
+    None where that is not known. out (M,): of a source that is watched, but not fused.
     """
 
     source: NDArray[np.intp]
@@ -38,6 +38,7 @@ class Rows:
     fresh: NDArray[np.bool_]
     kept: dict[str, int]
     kin: Kin | None = None
+    out: NDArray[np.bool_] | None = None
 
     @property
     def echo(self) -> NDArray[np.bool_]:
@@ -50,7 +51,8 @@ class Rows:
 
     def inside_mask(self) -> NDArray[np.bool_]:
         """`inside` as a mask (M,)."""
-        return np.asarray((self.tracks.link != NO_TRACK) & ~self.tracks.outside)
+        inside = (self.tracks.link != NO_TRACK) & ~self.tracks.outside
+        return np.asarray(inside if self.out is None else inside & ~self.out)
 
     def inside(self) -> NDArray[np.intp]:
         """Rows that belong to a global track and are fused in it: their newest datum has passed its gate."""

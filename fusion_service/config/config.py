@@ -94,6 +94,8 @@ class SourceConfig:
     registration_sigma: float = _setting(
         0.0, number(0.0, 1e5), "kind = intensity: m, error common to all it reports; SensorInfo: position_covariance"
     )
+    reference: bool = _setting(False, flag, "its clock and place are right: others are measured by it")
+    polar: bool | None = _setting(None, maybe(flag), "it measures ranges and bearings; left out: by its SensorInfo")
     inflation: float = _setting(1.0, number(0, 1e6, above=True), "factor on its covariances")
     feedback: bool = _setting(False, flag, "its tracker is fed with fused tracks: no tracklets of it")
     override: bool = _setting(False, flag, "use these values even where its SensorInfo says otherwise")
@@ -187,6 +189,23 @@ class CentreConfig:
     intensity_merge: float = _setting(2.0, number(0, 100), "d2 below which components of one mixture are merged")
     intensity_components: int = _setting(500, whole(1, 5000), "components kept at most")
     max_pending: int = _setting(10_000, whole(1, 10_000_000), "messages held per source for later steps")
+    supervision: str = _setting(
+        "act", choice("off", "watch", "act"), "sources beside each other: not looked at, told, or told and treated"
+    )
+    supervision_errors: float = _setting(0.001, number(1e-9, 1.0), "rate of false alarms about a sound source, 1/h")
+    registration: str = _setting(
+        "estimate",
+        choice("off", "estimate", "correct"),
+        "clock offsets and registration errors of sources: not looked for, told, or told and taken off",
+    )
+    registration_memory: float = _setting(
+        600.0, number(1.0, 1e6), "seconds after which what was seen of them counts for 1/e"
+    )
+    clock_sigma: float = _setting(1.0, number(0, 1e3), "how far off clocks of sources may be, s (1 sigma)")
+    translation_sigma: float = _setting(100.0, number(0, 1e6), "how far off their own places may be, m (1 sigma)")
+    heading_sigma: float = _setting(1.0, number(0, 90), "how far their headings may be turned, degrees (1 sigma)")
+    range_sigma: float = _setting(100.0, number(0, 1e6), "polar sources: how far off ranges may be, m (1 sigma)")
+    scale_sigma: float = _setting(0.001, number(0, 1), "polar sources: error of the scale of ranges (1 sigma)")
     fuse_origins: bool = _setting(False, flag, "fuse live, exercise, simulated and replayed data together")
     source_defaults: SourceConfig = _setting(SourceConfig(), lambda v: v, "for every source")
     sources: dict[str, SourceConfig] = _setting({}, table, "by name, over the defaults; global/NAME: a centre")
