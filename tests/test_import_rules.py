@@ -16,7 +16,7 @@ GROUND_FLOOR = {
     f"fusion_service.{name}"
     for name in (
         *("linalg", "geodesy", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
-        *("errors", "arrays", "order", "turn", "ways"),
+        *("errors", "arrays", "order", "turn", "ways", "source_words"),
     )
 }
 STANDS_ON = {

@@ -34,7 +34,7 @@ from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker, status_line
 from fusion_service.service.stepping import LastingCentre
 from fusion_service.service.tokens import Tokens
-from fusion_service.ways import no_tracklets
+from fusion_service.source_words import source_event
 from schemas import (
     GlobalTracks,
     LocalIntensity,
@@ -224,7 +224,7 @@ class Service:
         notes = made.result.status.notes
         if notes and self._told.allows(notes[0], 600.0):
             log.warning("%s", "; ".join(notes))
-        self._tell_tracklets(made.result.log)
+        self._tell_sources(made.result.log)
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._picture = made.messages["tracks"]
@@ -232,17 +232,17 @@ class Service:
             self._out[what].put(payload)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
 
-    def _tell_tracklets(self, journal: StepLog) -> None:
-        """Say whose tracks are no tracklets any more, and why, or are again: twenty lines a second at most."""
+    def _tell_sources(self, journal: StepLog) -> None:
+        """Say what has changed about sources: how they are trusted, shifted, used: twenty lines a second at most."""
         for event in journal.events:
-            if event.get("kind") != "tracklets":
+            if (said := source_event(event)) is None:
                 continue
-            if self._told.allows(f"tracklets {self._counts['tracklets'] % 20}", 1.0):
-                level = logging.WARNING if event.get("why") else logging.INFO
-                log.log(level, "source %s: %s", event.get("source"), no_tracklets(event))
-                self._counts["tracklets"] += 1
-            elif self._told.allows("many tracklets", 1.0):
-                log.warning("tracks of many sources are tracklets no more, or again: the status has them all")
+            bad, text = said
+            if self._told.allows(f"sources {self._counts['sources'] % 20}", 1.0):
+                log.log(logging.WARNING if bad else logging.INFO, "source %s: %s", event.get("source"), text)
+                self._counts["sources"] += 1
+            elif self._told.allows("many sources", 1.0):
+                log.warning("much has changed about many sources: the status has it all")
 
     def _publish_status(self) -> Status:
         last = self._result.status if self._result is not None else None

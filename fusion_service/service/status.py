@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fusion_service.bus import Inbox
+from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
 
@@ -90,6 +91,11 @@ def status_line(status: Status) -> str:
     tracks = ", ".join(f"{count} {name}" for name, count in status.tracks.items()) or "no step yet"
     alive = sum(bool(said.get("alive")) and not said.get("stale") for said in status.sources.values())
     line = f"{tracks}; {alive} of {len(status.sources)} sources alive"
+    doubted = {name: state for name, said in status.sources.items() if (state := state_of(said)) not in ("", "trusted")}
+    if len(doubted) > NAMED:
+        line = f"{line}; {len(doubted)} not trusted"
+    else:
+        line += "".join(f"; {name} {'in ' * (state == 'union')}{state}" for name, state in doubted.items())
     shares = {name: said for name, said in status.sources.items() if "tracklets" in said}
     if not shares:
         return line

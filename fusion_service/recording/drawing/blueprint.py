@@ -35,10 +35,12 @@ def blueprint(
     trail: float,
     centres: Sequence[str] = (),
     crowded: bool = False,
+    supervised: bool = False,
 ) -> Any:
     """The blueprint for a picture in `frame` within `bounds` (south-west, north-east; m), of whose `trails`
     (entities) the last `trail` seconds are seen. centres: whose global tracks it shows. crowded: there are too many
-    targets or tracks for a legend; a series under the pointer says its name."""
+    targets or tracks for a legend; a series under the pointer says its name. supervised: there are series of how far
+    sources are trusted, and shifted."""
     rr = import_rerun()
     import rerun.blueprint as rrb
 
@@ -64,12 +66,21 @@ def blueprint(
         _chart(rr, rrb, "/anees", "Mean NEES", 4.0),
         charts("influence", "Influence (weights per source)", 1.05),
     ]
+    watched = [
+        _chart(rr, rrb, "/consistency", "Sources beside each other (1 is right)", 3.0),
+        _chart(rr, rrb, "/clock", "Clock offsets (s, two sigma)"),
+        rrb.Spatial2DView(origin="/registration", name="Registration (m, two sigma)", background=BACKGROUND),
+    ]
     pages = [rrb.TextDocumentView(origin=entity("health", one), name=f"Health: {one}") for one in centres]
     told = [_log(rrb, "/log", "Status log"), *(pages or [rrb.TextDocumentView(origin="/health", name="Health")])]
     return _whole(
         rrb,
         rrb.Tabs(*pictures, active_tab=0),
-        [rrb.Tabs(*upper, active_tab=0), rrb.Tabs(*lower, active_tab=0), rrb.Tabs(*told, active_tab=0)],
+        [
+            rrb.Tabs(*upper, active_tab=0),
+            rrb.Tabs(*lower, *(watched if supervised else []), active_tab=0),
+            rrb.Tabs(*told, active_tab=0),
+        ],
     )
 
 

@@ -16,7 +16,8 @@ import numpy as np
 from fusion_service.recording.columns import ColumnWriter, Stamp, documents, entity, texts
 from fusion_service.recording.drawing.labels import utc
 from fusion_service.recording.drawing.tracks import Drawing
-from fusion_service.ways import fused_by, no_tracklets, tracklet_health
+from fusion_service.source_words import consistency, source_event, source_health, state_of
+from fusion_service.ways import fused_by, tracklet_health
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import DECISIONS, KEPT, NO_SOURCE
 
@@ -103,9 +104,10 @@ class EventLog:
             kind = str(event.get("kind", "event"))
             if kind in SAID_ELSEWHERE:
                 continue
-            if kind == "tracklets":
-                level = WARN if event.get("why") else INFO
-                self.say("sources", level, f"source {_short(event.get('source'))}: {no_tracklets(event)}", stamp)
+            if (said := source_event(event)) is not None:
+                bad, text = said
+                level = WARN if bad else INFO
+                self.say("sources", level, f"source {_short(event.get('source'))}: {text}", stamp)
                 continue
             rest = ", ".join(f"{key} {_short(value)}" for key, value in event.items() if key not in ("kind", "epoch"))
             self.say("services", INFO, f"service {message.source}: {kind}{f' ({rest})' if rest else ''}", stamp)
@@ -167,11 +169,16 @@ def _clock(time: int) -> str:
 def _page(message: Status) -> str:
     tracks = ", ".join(f"{count} {name}" for name, count in message.tracks.items())
     lines = [f"# {message.source}", f"step {message.step}, up {message.uptime:.0f} s, tracks: {tracks or 'none'}", ""]
-    lines += ["| source | state | messages | tracks | offset s | gaps | repeats |", "|---|---|---|---|---|---|---|"]
+    lines += ["| source | state | trust | beside others | messages | tracks | offset s | gaps | repeats |"]
+    lines += [f"|{9 * '---|'}"]
     for name, said in message.sources.items():
         cells = [said.get(key, "") for key in ("messages", "tracks", "offset", "gaps", "repeats")]
         shown = [f"{cell:.3g}" if isinstance(cell, float) else str(cell) for cell in cells]
-        lines.append(f"| {' | '.join([name, _state(said), *shown])} |")
+        found = consistency(said)
+        beside = "" if found is None else f"{found[0]:.2f} ({found[1]:.2f} to {found[2]:.2f})"
+        lines.append(f"| {' | '.join([name, _state(said), state_of(said), beside, *shown])} |")
+    health = [(name, source_health(said)) for name, said in message.sources.items()]
+    lines += ["", *(f"- **{name}** {line}" for name, told in health for line in told)]
     told = [(name, tracklet_health(said)) for name, said in message.sources.items()]
     if any(text for _, text in told):
         lines += ["", "| source | tracklets and innovations |", "|---|---|"]

@@ -15,6 +15,7 @@ from fusion_service.recording.columns import ColumnWriter, Stamp
 from fusion_service.recording.drawing.charts import Charts
 from fusion_service.recording.drawing.errors import TruthMatcher
 from fusion_service.recording.drawing.log import EventLog
+from fusion_service.recording.drawing.sources import SourceCharts
 from fusion_service.recording.drawing.tracks import Drawing
 from schemas import (
     FAULTS,
@@ -64,9 +65,12 @@ class Scene:
         self.crowded = False
         """Whether charts have so many series that a legend would hide them."""
         self.now: int | None = None
+        self.supervised = False
+        """Whether a status said how sources are trusted, or shifted."""
         self._start: int | None = None
         self.undrawn: Counter[str] = Counter()
         self._charts = Charts(columns, focus)
+        self._sources = SourceCharts(columns)
         self._matcher = TruthMatcher(cutoff)
         self._by_centre = False
         self._new: list[tuple[Message, Stamp]] = []
@@ -76,6 +80,7 @@ class Scene:
     def restart(self) -> None:
         """A new part of the recording begins."""
         self._charts.restart()
+        self._sources.restart()
         self.drawing.changed = True
 
     def mission_time(self, message: Message | None) -> int | None:
@@ -135,6 +140,8 @@ class Scene:
         self.drawing.colour_sources()
         if self.crowded != self._charts.crowded:
             self.crowded = self.drawing.changed = True
+        if self.supervised != self._sources.seen:
+            self.supervised = self.drawing.changed = True
 
     def _open_chart(self, patience: float) -> bool:
         """Whether the frame of the drawing, and a mission time, are known; takes the frame if it is time to."""
@@ -171,6 +178,8 @@ class Scene:
         if isinstance(message, Status):
             for source in event_log.status(message, stamp):
                 drawing.clear(source, stamp)
+            if stamp.time is not None:
+                self._sources.status(message, drawing.colours, stamp)
         elif isinstance(message, StepLog):
             event_log.step(message, stamp)
         elif isinstance(message, SensorInfo):

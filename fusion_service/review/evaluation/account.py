@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from fusion_service.review.evaluation.source_record import SourceRecords
 from fusion_service.ways import fused_by
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import BROKEN, CONFIRMED, GATE_FAILED, KEPT
@@ -23,7 +24,7 @@ class Account:
     tracks by number of their sources. ended: reason -> tracks. refused, dropped: (source, reason, "messages" or
     "tracks") -> how many. kept, failed, broken: source -> links that agreed, did not, were cut; innovation: source ->
     (n, sum of d2) of a link against the fusion of the other sources. dimension: of that d2, 0 without pictures.
-    status: the newest, None without.
+    status: the newest, None without. sources: what it said of them.
     """
 
     rules: Counter[str] = field(default_factory=Counter)
@@ -42,6 +43,7 @@ class Account:
     broken: Counter[str] = field(default_factory=Counter)
     innovation: dict[str, tuple[int, float]] = field(default_factory=dict)
     status: Status | None = None
+    sources: SourceRecords = field(default_factory=SourceRecords)
 
     def picture(self, message: GlobalTracks) -> None:
         """Enter a picture."""
@@ -58,6 +60,7 @@ class Account:
     def log(self, message: StepLog) -> None:
         """Enter a step log."""
         self.steps += 1
+        self.sources.log(message)
         self.runs.add(message.epoch)
         for event in message.events:
             if event.get("kind") == "tracklets":

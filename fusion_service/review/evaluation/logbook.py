@@ -200,6 +200,7 @@ class Logbook:
         elif isinstance(message, Status):
             account = self._account(name)
             known_status = account.status or message
+            account.sources.status(message)
             account.status = max(known_status, message, key=lambda one: (one.epoch, one.seq))
 
     def _note_traffic(

@@ -17,6 +17,7 @@ from fusion_service.review.evaluation.assess import Assessment, Evaluation
 from fusion_service.review.evaluation.report_text import CSS, WORDS
 from fusion_service.review.evaluation.results import facts, label, rows_of, rule_of
 from fusion_service.review.evaluation.scoring import Scores
+from fusion_service.review.evaluation.source_record import MOST_SAID, SourceRecords, sources_table
 from fusion_service.review.evaluation.tables import (
     DELAYS,
     NUMBERS,
@@ -86,6 +87,10 @@ def report(assessments: Sequence[Assessment]) -> str:
     if rows:
         figures = [f"<figure>{svg}<figcaption>{escape(text)}</figcaption></figure>" for svg, text in charts(rows)]
         body += ["<h2>Over time</h2>", f'<div class="charts">{"".join(figures)}</div>']
+    for one in assessments:
+        for name, account in one.book.accounts.items():
+            of = f": {label(one) or name}" if len(assessments) + len(one.book.accounts) > 2 else ""
+            body += _sources(one, account.sources, of)
     for one in assessments:
         body += _without_truth(one, f": {label(one)}" if len(assessments) > 1 else "")
     words = "".join(f"<dt>{escape(word)}</dt><dd>{escape(text)}</dd>" for word, text in WORDS.items())
@@ -230,6 +235,30 @@ def _mark(value: float, bounds: tuple[float, float]) -> str:
     """The class of a cell with a mean that lies within `bounds`, below or above; none without one."""
     low, high = bounds
     return "" if not np.isfinite(value) else "low" if value < low else "high" if value > high else "good"
+
+
+def _sources(one: Assessment, records: SourceRecords, of: str) -> list[str]:
+    """How the centre trusted the sources, and what it found of their clocks and places."""
+    from fusion_service.colours import source_colours
+    from fusion_service.review.evaluation.report_sources import source_charts
+
+    table, said = sources_table(records)
+    if not table:
+        return []
+    head, *lines = table
+    found = [f"<h2>The sources{escape(of)}</h2>", _table(head, lines, left=2)]
+    found.append('<p class="note">At the end; ± one standard deviation. The charts show how it came to be.</p>')
+    found += [f"<p>{escape(sentence)}</p>" for sentence in said]
+    start = one.book.span[0] if one.book.span else 0
+    events = sorted((time, name, text) for name, record in records.by_name.items() for time, _, text in record.said)
+    if events:
+        rows = [[f"{(time - start) / 1e9:.1f}", name, text] for time, name, text in events[:MOST_SAID]]
+        left = len(events) - len(rows) + sum(record.more for record in records.by_name.values())
+        found += ["<h3>What was said of them</h3>", _table(("s", "source", ""), rows, left=3)]
+        found += [f'<p class="note">{left} more.</p>'] if left else []
+    figures = source_charts(records, start, source_colours([*one.book.sources, *one.book.infos]))
+    shown = [f"<figure>{svg}<figcaption>{escape(text)}</figcaption></figure>" for svg, text in figures]
+    return [*found, f'<div class="charts">{"".join(shown)}</div>'] if shown else found
 
 
 def _without_truth(one: Assessment, which: str) -> list[str]:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import io
-import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from html import escape
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +20,7 @@ from fusion_service.colours import (
     VERMILION,
     source_colours,
 )
+from fusion_service.review.evaluation.figures import chart, legend, thin
 from fusion_service.review.evaluation.latency import BINS
 from fusion_service.review.evaluation.scoring import WINDOW, Scores
 from fusion_service.review.evaluation.tables import ScoredCentre, power_of_ten, row_name
@@ -36,30 +33,9 @@ if TYPE_CHECKING:
 __all__ = ["charts", "delay_chart"]
 
 
-POINTS = 500
-"""Points of a line, at most: means over equal parts of the mission where there are more times."""
-SIZE = (5.0, 3.0)
 PARTS = {"localisation": SKY, "missed": ORANGE, "false": VERMILION}
 Line = tuple[str, str, float, Scores, Floats]
 """Name, colour, width, scores, and seconds (K,) since the first scored time."""
-STYLE: Any = {
-    "svg.fonttype": "none",
-    "text.parse_math": False,
-    "font.family": "sans-serif",
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "grid.linewidth": 0.6,
-    "axes.axisbelow": True,
-    "axes.titlesize": 10,
-    "axes.titleweight": "bold",
-    "axes.titlelocation": "left",
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "lines.linewidth": 1.4,
-}
 
 
 def charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
@@ -75,20 +51,20 @@ def charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
         found += _number_charts(rows)
     found.append(
         (
-            _chart(lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"), "OSPA(2): tracks, not points"),
+            chart(lambda axes: _over_time(axes, lines, "ospa2", "OSPA(2), m"), "OSPA(2): tracks, not points"),
             f"Compares whole tracks over {WINDOW} scored times: a track that changes its target or breaks costs too. "
             "Lower is better.",
         )
     )
     if any(np.isfinite(row.evaluation.confirm).any() for row in rows):
         text = "Share of the targets that a source covered or tracked which had a fused track after so many seconds."
-        found.append((_chart(lambda axes: _confirm(axes, rows), "Time to confirm"), text))
+        found.append((chart(lambda axes: _confirm(axes, rows), "Time to confirm"), text))
     return found
 
 
 def _parts_chart(rows: Sequence[ScoredCentre]) -> tuple[str, str]:
     return (
-        _chart(lambda axes: _parts(axes, rows[0]), f"GOSPA², its parts{_of(rows)}"),
+        chart(lambda axes: _parts(axes, rows[0]), f"GOSPA², its parts{_of(rows)}"),
         "Its parts: errors of position, targets missed, false tracks. The tallest layer is what to mend.",
     )
 
@@ -98,15 +74,15 @@ def _error_charts(rows: Sequence[ScoredCentre], lines: Sequence[Line]) -> list[t
     beside = "the fused tracks of each row" if len(rows) > 1 else "each source and the fused tracks"
     return [
         (
-            _chart(lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"), "GOSPA over time"),
+            chart(lambda axes: _over_time(axes, lines, "gospa", "GOSPA, m"), "GOSPA over time"),
             f"All faults in one number for {beside}. Lower is better.",
         ),
         (
-            _chart(lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"), "Error of position over time"),
+            chart(lambda axes: _over_time(axes, lines, "rmse", "RMSE, m"), "Error of position over time"),
             "Only of targets that are followed at that time: a source that follows only easy ones looks good here.",
         ),
         (
-            _chart(lambda axes: _nees(axes, lines), "Consistency: ANEES over time"),
+            chart(lambda axes: _nees(axes, lines), "Consistency: ANEES over time"),
             "1 is ideal. Above the band the covariances are too small (overconfident), below it too large (cautious).",
         ),
     ]
@@ -116,12 +92,12 @@ def _number_charts(rows: Sequence[ScoredCentre]) -> list[tuple[str, str]]:
     """How many fused tracks there are, and how many of them are right."""
     return [
         (
-            _chart(lambda axes: _cardinality(axes, rows), "How many there are"),
+            chart(lambda axes: _cardinality(axes, rows), "How many there are"),
             "Targets that exist, and fused tracks that are shown. Shown below true: missed; above: false or double. "
             "Expected: the sum of existence probabilities, tentative tracks included.",
         ),
         (
-            _chart(lambda axes: _siap(axes, rows[0]), f"SIAP of the fused tracks{_of(rows)}"),
+            chart(lambda axes: _siap(axes, rows[0]), f"SIAP of the fused tracks{_of(rows)}"),
             "Complete: share of targets with a track. Spurious: share of tracks without a target. Tracks per "
             "target that has one: 1 is ideal.",
         ),
@@ -139,9 +115,9 @@ def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str)
             edges = 1000 * np.array(delay.edges)[::wide]
             axes.stairs(100 * share, edges, color=colours.get(name, PAPER_FUSED), label=name, lw=1.4)
         axes.set(xlabel="delay, ms", ylabel="messages, %", ylim=(0, None))
-        _legend(axes)
+        legend(axes)
 
-    return _chart(draw, title)
+    return chart(draw, title)
 
 
 def _of(rows: Sequence[ScoredCentre]) -> str:
@@ -170,25 +146,14 @@ def _seconds(times: NDArray[np.int64]) -> Floats:
     return seconds
 
 
-def _thin(seconds: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Means over parts of the mission, so that a line has `POINTS` at most."""
-    if len(seconds) <= POINTS:
-        return seconds, values
-    part = np.arange(len(seconds)) * POINTS // len(seconds)
-    known = np.isfinite(values)
-    with np.errstate(invalid="ignore"):
-        mean = np.bincount(part, np.where(known, values, 0.0), POINTS) / np.bincount(part, known, POINTS)
-    return np.bincount(part, seconds, POINTS) / np.bincount(part, minlength=POINTS), mean
-
-
 def _parts(axes: Axes, row: ScoredCentre) -> None:
     series, seconds = row.evaluation.fused.series, _seconds(row.evaluation.times)
     power = 3 * int(np.floor(np.log10(max(float((series.gospa**2).max()), 1.0)) / 3))
-    layers = [_thin(seconds, getattr(series, name))[1] / 10**power for name in PARTS]
-    axes.stackplot(_thin(seconds, series.gospa)[0], *layers, labels=list(PARTS), colors=list(PARTS.values()), lw=0)
+    layers = [thin(seconds, getattr(series, name))[1] / 10**power for name in PARTS]
+    axes.stackplot(thin(seconds, series.gospa)[0], *layers, labels=list(PARTS), colors=list(PARTS.values()), lw=0)
     unit = f"{power_of_ten(power)} m²" if power else "m²"
     axes.set(xlabel="s since the first scored time", ylabel=unit, ylim=(0, None))
-    _legend(axes)
+    legend(axes)
 
 
 def _over_time(axes: Axes, lines: Sequence[Line], what: str, unit: str) -> None:
@@ -196,37 +161,37 @@ def _over_time(axes: Axes, lines: Sequence[Line], what: str, unit: str) -> None:
         values = getattr(scores.series, what)
         if what == "ospa2":
             seconds = seconds[scores.series.windows]
-        axes.plot(*_thin(seconds, values), color=colour, lw=width, label=name)
+        axes.plot(*thin(seconds, values), color=colour, lw=width, label=name)
     axes.set(xlabel="s since the first scored time", ylabel=unit, ylim=(0, None))
-    _legend(axes)
+    legend(axes)
 
 
 def _nees(axes: Axes, lines: Sequence[Line]) -> None:
     _, _, _, fused, seconds = lines[-1] if lines[-1][0].startswith("fused") else lines[0]
-    x, low = _thin(seconds, fused.series.low)
-    axes.fill_between(x, low, _thin(seconds, fused.series.high)[1], color=GREEN, alpha=0.18, lw=0, label="95 %")
+    x, low = thin(seconds, fused.series.low)
+    axes.fill_between(x, low, thin(seconds, fused.series.high)[1], color=GREEN, alpha=0.18, lw=0, label="95 %")
     axes.axhline(1.0, color=GREEN, lw=0.8)
     for name, colour, width, scores, at in lines:
-        axes.plot(*_thin(at, scores.series.anees), color=colour, lw=width, label=name)
+        axes.plot(*thin(at, scores.series.anees), color=colour, lw=width, label=name)
     values = np.concatenate([scores.series.anees[np.isfinite(scores.series.anees)] for *_, scores, _ in lines])
     top = float(np.quantile(values, 0.99)) * 1.15 if len(values) else 2.0
     axes.set(xlabel="s since the first scored time", ylabel="NEES / dimension", ylim=(0, max(top, 2.0)))
-    _legend(axes)
+    legend(axes)
 
 
 def _cardinality(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
     first = rows[0].evaluation
     seconds = _seconds(first.times)
-    axes.plot(*_thin(seconds, first.exists.sum(axis=1).astype(float)), color=PAPER_TRUTH, lw=4, alpha=0.6, label="true")
+    axes.plot(*thin(seconds, first.exists.sum(axis=1).astype(float)), color=PAPER_TRUTH, lw=4, alpha=0.6, label="true")
     if len(rows) == 1:
-        axes.plot(*_thin(seconds, first.fused.series.shown.astype(float)), color=PAPER_FUSED, label="shown")
+        axes.plot(*thin(seconds, first.fused.series.shown.astype(float)), color=PAPER_FUSED, label="shown")
         if np.isfinite(first.fused.series.expected).any():
-            axes.plot(*_thin(seconds, first.fused.series.expected), "--", color=BLUE, lw=1.2, label="expected")
+            axes.plot(*thin(seconds, first.fused.series.expected), "--", color=BLUE, lw=1.2, label="expected")
     else:
         for name, colour, width, scores, at in _lines(rows):
-            axes.plot(*_thin(at, scores.series.shown.astype(float)), color=colour, lw=width, label=name)
+            axes.plot(*thin(at, scores.series.shown.astype(float)), color=colour, lw=width, label=name)
     axes.set(xlabel="s since the first scored time", ylabel="targets, tracks", ylim=(0, None))
-    _legend(axes)
+    legend(axes)
 
 
 def _siap(axes: Axes, row: ScoredCentre) -> None:
@@ -236,9 +201,9 @@ def _siap(axes: Axes, row: ScoredCentre) -> None:
         ("spuriousness", "spurious", VERMILION),
         ("ambiguity", "tracks per target", BLUE),
     ):
-        axes.plot(*_thin(seconds, getattr(series, name)), color=colour, label=label)
+        axes.plot(*thin(seconds, getattr(series, name)), color=colour, label=label)
     axes.set(xlabel="s since the first scored time", ylabel="share, number", ylim=(-0.03, None))
-    _legend(axes)
+    legend(axes)
 
 
 def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
@@ -253,49 +218,4 @@ def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
         axes.step([0, *x], [0, *(100 * y / known)], where="post", color=tones[k % len(tones)], label=label)
     axes.set(xlabel="s since it could be known", ylabel="targets confirmed, %", ylim=(0, 104), xlim=(0, None))
     if len(rows) > 1:
-        _legend(axes)
-
-
-def _legend(axes: Axes) -> None:
-    """Above the picture, so that it hides nothing."""
-    handles, labels = axes.get_legend_handles_labels()
-    room = 58 - 7 * len(handles) - sum(map(len, labels))
-    axes.legend(
-        loc="lower left",
-        bbox_to_anchor=(-0.02, 1.0),
-        ncols=len(handles) if room > 0 else max(1, min(3, 50 // (7 + max(map(len, labels))))),
-        columnspacing=1.2,
-        handlelength=1.4,
-        borderaxespad=0.1,
-    )
-
-
-def _chart(draw: Callable[[Axes], None], title: str) -> str:
-    with _figure() as figure:
-        axes = figure.subplots()
-        draw(axes)
-        figure.suptitle(title, x=0.01, ha="left", fontsize=10, fontweight="bold")
-        out = io.StringIO()
-        figure.savefig(out, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return _inline(out.getvalue(), title)
-
-
-@contextmanager
-def _figure() -> Iterator[Any]:
-    import matplotlib as mpl
-    from matplotlib.figure import Figure
-
-    with mpl.rc_context({**STYLE, "svg.hashsalt": "report"}):
-        yield Figure(figsize=SIZE, layout="constrained")
-
-
-def _inline(svg: str, title: str) -> str:
-    """For the middle of an HTML page: no header, no addresses, no ids but those that are referred to."""
-    svg = svg[svg.index("<svg") :]
-    svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.DOTALL)
-    svg = re.sub(r'\sxmlns(:\w+)?="[^"]*"', "", svg)
-    svg = re.sub(r'\sid="[A-Za-z_.0-9]+_\d+"', "", svg)
-    svg = re.sub(r"(\d\.\d\d)\d+", r"\1", svg)
-    svg = re.sub(r'<svg ([^>]*?)width="[^"]*"', r"<svg \1", svg, count=1)
-    svg = re.sub(r'(<svg [^>]*?)height="[^"]*"', r"\1", svg, count=1)
-    return svg.replace("<svg ", f'<svg role="img" aria-label="{escape(title)}" ', 1)
+        legend(axes)

@@ -21,6 +21,7 @@ from fusion_service.review.evaluation.tables import (
     tracking_table,
     truthless_lines,
 )
+from fusion_service.source_words import biases, consistency, state_of
 
 __all__ = ["facts", "label", "results", "rows_of", "rule_of", "text"]
 
@@ -149,6 +150,18 @@ def _centre(one: Assessment, name: str) -> dict[str, Any]:
         "rules": dict(account.rules),
         "fused_by": dict(account.ways),
         "no_tracklets": {source: why for source, why in sorted(account.ungiven.items()) if why},
+        "sources": {
+            source: {
+                "state": state_of(record.newest),
+                "consistency": plain((consistency(record.newest) or (float("nan"),))[0]),
+                "bias": {
+                    one.key: {"value": one.value, "sigma": one.sigma, "unit": one.unit, "observable": one.observable}
+                    for one in biases(record.newest)
+                },
+                "said": [{"time_ns": time, "bad": bad, "text": text} for time, bad, text in record.said],
+            }
+            for source, record in sorted(account.sources.by_name.items())
+        },
         "runs": len(account.runs),
         "steps": account.steps,
         "confirmed_by_sources": {str(n): count for n, count in sorted(account.shown.items())},

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from fusion_service.review.evaluation.source_record import sources_table
 from fusion_service.ways import reason_words
 
 if TYPE_CHECKING:
@@ -302,6 +303,7 @@ def truthless_lines(assessment: Assessment, centre: str) -> list[str]:
                 table.append([f"{a}, {b}", str(pair.n), fixed(pair.mean), fixed(*pair.bounds), pair_words(pair)])
         lines += [*aligned(table, last_left=True), ""]
     if account:
+        lines += _source_lines(account)
         lines += _account_lines(account)
     quiet = [(name, one) for (kind, name), one in sorted(book.traffic.items()) if one.missing or one.silent]
     lines += [
@@ -344,6 +346,14 @@ def links(account: Account) -> list[list[str]]:
         if any(counts):
             lines.append([name, *map(str, counts), fixed(mean)])
     return lines
+
+
+def _source_lines(account: Account) -> list[str]:
+    table, said = sources_table(account.sources)
+    if not table:
+        return []
+    title = "The sources, as the centre saw them at the end (normalised square beside the others, 1 is right):"
+    return [title, *aligned(table, left=2), *said, ""]
 
 
 def _account_lines(account: Account) -> list[str]:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_service.recording.steps import Step
-from fusion_service.ways import fused_by, no_tracklets
+from fusion_service.source_words import source_event
+from fusion_service.ways import fused_by
 from schemas import GlobalTracks
 from schemas.messages import CONFIRMED
 
@@ -38,12 +39,13 @@ class Spell:
 
 @dataclass(frozen=True, slots=True)
 class SourceSaid:
-    """What the centre said of a source at a time, ns, in words; given: whether its tracks are tracklets since."""
+    """What the centre said of a source at a time, ns, in words; kind: of the event; good: whether all is well since."""
 
     time: int
     source: str
     text: str
-    given: bool
+    kind: str
+    good: bool
 
 
 class FusedBy:
@@ -61,9 +63,9 @@ class FusedBy:
         """Take a step of the centre; track: the one that is asked for, if any."""
         if step.log is not None and len(self.said) < MOST:
             self.said += [
-                SourceSaid(step.time, str(event.get("source", "")), no_tracklets(event), not event.get("why"))
+                SourceSaid(step.time, str(event.get("source", "")), said[1], str(event.get("kind")), not said[0])
                 for event in step.log.events
-                if event.get("kind") == "tracklets"
+                if (said := source_event(event)) is not None
             ]
         if step.picture is not None:
             self._picture(step.picture, track)
@@ -100,17 +102,17 @@ class FusedBy:
     def of(self, sources: Iterable[str], first: int, last: int) -> list[SourceSaid]:
         """What was said of these sources between two times, ns, and what held of them before."""
         wanted = set(sources)
-        before = {one.source: one for one in self.said if one.source in wanted and one.time < first}
+        before = {(one.source, one.kind): one for one in self.said if one.source in wanted and one.time < first}
         return [
             one
             for one in self.said
-            if one.source in wanted and one.time <= last and (one.time >= first or before[one.source] is one)
+            if one.source in wanted and one.time <= last and (one.time >= first or before[one.source, one.kind] is one)
         ]
 
-    def ungiven(self) -> list[SourceSaid]:
-        """The newest word on each source whose tracks are no tracklets at the end."""
-        newest = {one.source: one for one in self.said}
-        return [newest[name] for name in sorted(newest) if not newest[name].given]
+    def unwell(self) -> list[SourceSaid]:
+        """The newest word of each kind on each source, where it is bad news at the end."""
+        newest = {(one.source, one.kind): one for one in self.said}
+        return [newest[key] for key in sorted(newest) if not newest[key].good]
 
 
 def shares(steps: Counter[str]) -> str:

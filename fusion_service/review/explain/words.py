@@ -63,9 +63,9 @@ def listing(mission: RecordedMission, *, everything: bool = False) -> str:
 
 
 def _ways(mission: RecordedMission) -> list[str]:
-    """By which ways confirmed tracks were fused, and whose tracks were no tracklets at the end, and why."""
+    """By which ways confirmed tracks were fused, and what was amiss with sources at the end."""
     ways = mission.fused_by
-    said = [f"{one.source}: {one.text} (since {mission.seconds(one.time):.1f} s)" for one in ways.ungiven()]
+    said = [f"{one.source}: {one.text} (since {mission.seconds(one.time):.1f} s)" for one in ways.unwell()]
     return [f"fused by: {shares(ways.all)} of the steps of confirmed tracks", *said] if ways.several or said else []
 
 
@@ -169,7 +169,7 @@ class _Teller:
         return f"{one.source}: {' and '.join(parts)} refused ({one.reason})"
 
     def _fused_by(self) -> Iterator[tuple[int, str, str]]:
-        """Lines of how it was fused, and of its sources that give no tracklets."""
+        """Lines of how it was fused, and of what was said of its sources."""
         ways = self.mission.fused_by
         if ways.several:
             yield from ((one.first, self._span(one.first, one.last), str(one)) for one in ways.spells())
@@ -265,8 +265,8 @@ class _Teller:
             said.append(f"Of {ways.steps.total()} steps with a source it was fused by {', '.join(parts)}.")
         elif ways.several and ways.steps:
             said.append(f"It was fused by {next(iter(ways.steps))} all the time.")
-        newest = {one.source: one for one in self._said_of_sources()}
-        return said + [f"{name}: {one.text}." for name, one in sorted(newest.items()) if not one.given]
+        newest = {(one.source, one.kind): one for one in self._said_of_sources()}
+        return said + [f"{name}: {one.text}." for (name, _), one in sorted(newest.items()) if not one.good]
 
     def _became(self) -> list[str]:
         story = self.story
