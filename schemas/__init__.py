@@ -2,6 +2,7 @@
 
 from schemas.codec import MAX_BYTES, VERSION, decode, digest, encode
 from schemas.errors import REASONS, FusionError, MessageError
+from schemas.extents import MAX_EXTENT, REFERENCES, SHAPES
 from schemas.keys import (
     REALM,
     Key,
@@ -53,10 +54,13 @@ __all__ = [
     "DECISIONS",
     "FAULTS",
     "MAX_BYTES",
+    "MAX_EXTENT",
     "MOTIONS",
     "ORIGINS",
     "REALM",
     "REASONS",
+    "REFERENCES",
+    "SHAPES",
     "STATUSES",
     "UNKNOWN_SIGMA",
     "VERSION",

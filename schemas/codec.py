@@ -36,7 +36,7 @@ def encode(message: Message) -> bytes:
     """The MessagePack bytes of a message. `MessageError` if its parts do not fit together, a number does not
     fit its column, or a covariance is not symmetric."""
     data = _pack(message)
-    for name in ("covariances", "position_covariance"):
+    for name in ("covariances", "position_covariance", "reference_covariances"):
         matrices = getattr(message, name, None)
         if matrices is not None:
             try:

@@ -114,6 +114,10 @@ class LocalTracks(Header):
     ids (T,) u64; means (C, n); covariances (C, n, n), symmetric; counts (T,) u16 components per track and
     weights (C,) summing to 1 per track, both None for one component each; existence (T,) in [0, 1];
     updated (T,) i64 time of the last measurement; identity, kind: a text or None per track; kind_p (T,).
+    extent (T, 3): full length and width, m, and heading of the long axis, rad, in `frame`, NaN where not known (see
+    `extents`), extent_sigma (T, 3) their standard deviations; shape, of all: one of `SHAPES`, None: the first;
+    reference: what of an object the means are, one of `REFERENCES`, None: the first; reference_covariances (T, 2, 2),
+    m2, in x and y: how far that may lie from the object's centre, the same from report to report.
     """
 
     type: ClassVar[str] = "local_tracks"
@@ -133,6 +137,11 @@ class LocalTracks(Header):
     kind: tuple[str | None, ...] | None = None
     kind_p: Floats | None = None
     track_lineage: U8 | None = None
+    extent: Floats | None = None
+    extent_sigma: Floats | None = None
+    shape: str | None = None
+    reference: str | None = None
+    reference_covariances: Floats | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -184,7 +193,7 @@ class GlobalTracks(Header):
     rules: the ways that tracks were fused by, and track_rule (T,) u8 the index of each track's.
     identity, kind: what it is, a text or None per track, with the probabilities identity_p and kind_p (T,);
     track_origin (T,) u8 index into `ORIGINS`; marks (T,) u8, bits of `MARKS`; number (T,) u32 and callsign: how
-    an operator has named it (0, None: not).
+    an operator has named it (0, None: not). extent, extent_sigma (T, 3), shape: fused, as in `LocalTracks`.
     """
 
     type: ClassVar[str] = "global_tracks"
@@ -220,6 +229,9 @@ class GlobalTracks(Header):
     number: U32 | None = None
     callsign: tuple[str | None, ...] | None = None
     track_lineage: U8 | None = None
+    extent: Floats | None = None
+    extent_sigma: Floats | None = None
+    shape: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +300,11 @@ class Status(Header):
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Truth(Header):
-    """True states of T objects (simulation and playback): ids (T,) u64, means (T, n)."""
+    """True states of T objects (simulation and playback): ids (T,) u64, means (T, n).
+
+    extent (T, 3) and shape of their hulls as in `LocalTracks`; extent_offset (T, 2): where the state's place lies from
+    the centre of the hull, m along its heading and to the left of it; None, or NaN: in the centre.
+    """
 
     type: ClassVar[str] = "truth"
     time: int
@@ -296,6 +312,9 @@ class Truth(Header):
     frame: Frame
     ids: U64
     means: Floats
+    extent: Floats | None = None
+    extent_offset: Floats | None = None
+    shape: str | None = None
 
 
 Message: TypeAlias = LocalTracks | LocalIntensity | SensorInfo | GlobalTracks | StepLog | Status | Truth

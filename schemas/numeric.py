@@ -2,9 +2,9 @@
 
 A density is sound when its numbers are finite and within `MAX_MEAN` and `VARIANCES`, its covariance is
 positive definite (LDL' factorisation, every pivot above `PIVOT` times the variance it started from), its
-weights are not negative and sum to 1 per track (an intensity's only are finite and not negative), and its
-existence is in [0, 1]. Every operation is element by element over the batch, so that a message gets the same
-codes alone and among others.
+weights are not negative and sum to 1 per track (an intensity's only are finite and not negative), its existence
+is in [0, 1], and what it says of an extent is sound (see `extents`). Every operation is element by element over
+the batch, so that a message gets the same codes alone and among others.
 """
 
 from __future__ import annotations
@@ -16,11 +16,12 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.extents import sound_extents, sound_references, sound_sigmas
 from schemas.messages import Floats, GlobalTracks, LocalIntensity, LocalTracks
 
 __all__ = ["FAULTS", "check_numbers"]
 
-FAULTS = ("", "not-finite", "out-of-range", "not-positive-definite", "weights", "existence")
+FAULTS = ("", "not-finite", "out-of-range", "not-positive-definite", "weights", "existence", "extent")
 """Reasons by the code that `check_numbers` gives; 0 is sound. The first that holds is given."""
 
 MAX_MEAN = 1e12
@@ -30,7 +31,8 @@ WEIGHT_SUM = 1e-6
 BLOCK = 2048
 """Densities factorised at a time: what fits the cache."""
 
-_FINITE, _RANGE, _DEFINITE, _WEIGHTS, _EXISTENCE = range(1, 6)
+_FINITE, _RANGE, _DEFINITE, _WEIGHTS, _EXISTENCE, _EXTENT = range(1, 7)
+_EXTENTS = (("extent", sound_extents), ("extent_sigma", sound_sigmas), ("reference_covariances", sound_references))
 
 Densities: TypeAlias = LocalTracks | LocalIntensity | GlobalTracks
 Codes: TypeAlias = NDArray[np.uint8]
@@ -56,6 +58,7 @@ def check_numbers(messages: Sequence[Densities]) -> list[Codes]:
                 faults[index] = codes[low:high]
         _weight_faults(messages, faults)
         _existence_faults(messages, faults)
+        _extent_faults(messages, faults)
     return faults
 
 
@@ -126,3 +129,11 @@ def _existence_faults(messages: Sequence[Densities], faults: list[Codes]) -> Non
         return
     for index, values in told:
         faults[index][(faults[index] == 0) & ~((values >= 0) & (values <= 1))] = _EXISTENCE
+
+
+def _extent_faults(messages: Sequence[Densities], faults: list[Codes]) -> None:
+    for index, message in enumerate(messages):
+        for name, is_sound in _EXTENTS:
+            column = getattr(message, name, None)
+            if column is not None:
+                faults[index][(faults[index] == 0) & ~is_sound(column)] = _EXTENT

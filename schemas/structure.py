@@ -100,11 +100,30 @@ def _lineages(values: Values, tracks: int) -> None:
     values["track_lineage"] = bits.reshape(tracks, width)
 
 
+def _rows_of(values: Values, tracks: int, width: int, *names: str) -> None:
+    """Columns of so many numbers a track, where they are there."""
+    _lengths(values, tracks * width, *names)
+    for name in names:
+        if values[name] is not None:
+            values[name] = values[name].reshape(tracks, width)
+
+
+def _references(values: Values, tracks: int) -> None:
+    packed = values["reference_covariances"]
+    if packed is None:
+        return
+    _lengths(values, 3 * tracks, "reference_covariances")
+    values["reference_covariances"] = covariances = unpack_lower(packed.reshape(tracks, 3), 2)
+    covariances.flags.writeable = False
+
+
 def _local(values: Values) -> None:
     ids = values["ids"]
     _unique(ids)
     _lengths(values, len(ids), "existence", "updated", "identity", "kind", "kind_p")
     _lineages(values, len(ids))
+    _rows_of(values, len(ids), 3, "extent", "extent_sigma")
+    _references(values, len(ids))
     _densities(values, _components(values, len(ids)))
 
 
@@ -145,6 +164,7 @@ def _global(values: Values) -> None:
     if values["track_origin"] is not None and tracks and values["track_origin"].max() >= len(ORIGINS):
         raise MessageError("bad-field", f"track_origin: beyond {len(ORIGINS) - 1}")
     _lineages(values, tracks)
+    _rows_of(values, tracks, 3, "extent", "extent_sigma")
     _densities(values, _components(values, tracks))
 
 
@@ -163,6 +183,8 @@ def _truth(values: Values) -> None:
     _unique(ids)
     _lengths(values, len(ids) * n, "means")
     values["means"] = values["means"].reshape(len(ids), n)
+    _rows_of(values, len(ids), 3, "extent")
+    _rows_of(values, len(ids), 2, "extent_offset")
 
 
 def _nothing(values: Values) -> None:

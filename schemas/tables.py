@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from schemas import values
+from schemas.extents import REFERENCES, SHAPES
 from schemas.messages import (
     GlobalTracks,
     LocalIntensity,
@@ -81,6 +82,9 @@ _MEANS = _column("means", "<f8", ndim=2)
 _DENSITIES = (_MEANS, _covariances("covs", "covariances", 3))
 _MIXED = (_column("counts", "<u2", optional=True), _column("weights", "<f8", optional=True))
 _LINEAGES = _column("track_lineage", "u1", optional=True, ndim=2)
+_EXTENT = _column("extent", "<f8", optional=True, ndim=2)
+_SIGMA = _column("extent_sigma", "<f8", optional=True, ndim=2)
+_SHAPE = _plain("shape", values.one_of(SHAPES), optional=True)
 
 DECISION_COLUMNS = {
     "kind": "u1",
@@ -108,6 +112,11 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("kind", _TEXTS, list, optional=True),
         _column("kind_p", "<f8", optional=True),
         _LINEAGES,
+        _EXTENT,
+        _SIGMA,
+        _SHAPE,
+        _plain("reference", values.one_of(REFERENCES), optional=True),
+        _covariances("reference_covs", "reference_covariances", 3, optional=True),
     ),
     LocalIntensity: (*_HEADER, _TIME, *_WHERE, _HEIGHT, _column("weights", "<f8"), *_DENSITIES),
     SensorInfo: (
@@ -155,6 +164,9 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _column("number", "<u4", optional=True),
         _plain("callsign", _TEXTS, list, optional=True),
         _LINEAGES,
+        _EXTENT,
+        _SIGMA,
+        _SHAPE,
     ),
     StepLog: (
         *_HEADER,
@@ -184,7 +196,16 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("memory", values.u64, optional=True),
         _plain("notes", values.list_of(values.text), list, optional=True),
     ),
-    Truth: (*_HEADER, _TIME, *_WHERE, _IDS, _MEANS),
+    Truth: (
+        *_HEADER,
+        _TIME,
+        *_WHERE,
+        _IDS,
+        _MEANS,
+        _EXTENT,
+        _column("extent_offset", "<f8", optional=True, ndim=2),
+        _SHAPE,
+    ),
 }
 """Message class -> its fields, after `v` and `type`."""
 

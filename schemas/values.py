@@ -163,10 +163,16 @@ def free(value: Any, depth: int = 0) -> Any:
 free_map = map_of(partial(free, depth=1))
 
 
-def origin(value: Any) -> str:
-    if value not in ORIGINS:
-        raise ValueError(f"not one of {' '.join(ORIGINS)}")
-    return cast(str, value)
+def one_of(words: tuple[str, ...]) -> Convert:
+    def read(value: Any) -> str:
+        if value not in words:
+            raise ValueError(f"not one of {' '.join(words)}")
+        return cast(str, value)
+
+    return read
+
+
+origin = one_of(ORIGINS)
 
 
 _check_space = lru_cache(maxsize=256)(check_space)

@@ -36,6 +36,7 @@ from schemas import (
     local_key,
     truth_key,
 )
+from schemas.extents import sound_extents, sound_offsets
 
 __all__ = ["TrackPublisher", "TruthPublisher"]
 
@@ -203,15 +204,23 @@ class TrackPublisher(_MessagePublisher):
         kind: Sequence[str | None] | None = None,
         kind_p: ArrayLike | None = None,
         lineages: Sequence[Sequence[str]] | None = None,
+        extent: ArrayLike | None = None,
+        extent_sigma: ArrayLike | None = None,
+        shape: str | None = None,
+        reference: str | None = None,
+        reference_covariances: ArrayLike | None = None,
     ) -> LocalTracks:
         """Publish T tracks that hold at `time` (ns UTC), as Gaussians or mixtures of C components in all.
 
         space: n component names; ids (T,); means (C, n) and covariances (C, n, n) in `frame`, SI units. One
         component per track unless `counts` (T,) says how many, with `weights` (C,) summing to 1 per track.
         complete: this is all the source has, an id that is not listed is gone (T = 0 is then valid).
-        Optional per track: existence in [0, 1], updated (time of the last measurement, ns), identity
-        ("mmsi:...", "icao:..."), kind and kind_p; lineages: of the publisher's lineage the names whose data are in each
-        track; height: where a two-dimensional source's tracks are.
+        Per track: existence in [0, 1], updated (time of the last measurement, ns), identity ("mmsi:..."), kind, kind_p;
+        lineages: of the publisher's lineage the names whose data are in each track; height: where a two-dimensional
+        source's tracks are; extent (T, 3): length, width (m) and heading of the long axis (rad, from x to y), NaN where
+        not known, with extent_sigma (T, 3) and shape ("ellipse", "box"); reference: what of the object a mean is
+        ("centre", "antenna", "nearest", "blob"); reference_covariances (T, 2, 2), m2 in x and y: how far that may lie
+        from the centre.
         Arrays may be anything NumPy can read. `MessageError` names the track that is unsound.
         """
         names = _space(space)
@@ -231,6 +240,10 @@ class TrackPublisher(_MessagePublisher):
             "kind": None if kind is None else tuple(kind),
             "kind_p": _maybe(_floats, "kind_p", kind_p, (None,)),
             "track_lineage": None if lineages is None else _bits(lineages, self._lineage or ()),
+            **_threes(extent=extent, extent_sigma=extent_sigma),
+            "shape": shape,
+            "reference": reference,
+            "reference_covariances": _maybe(_floats, "reference_covariances", reference_covariances, (None, 2, 2)),
         }
         return self._send(LocalTracks, local_key(self.source, "tracks", self.realm), 8, parts)
 
@@ -264,21 +277,46 @@ class TruthPublisher(_MessagePublisher):
     the scenario's name stands for the source's."""
 
     def truth(
-        self, *, time: SupportsIndex, space: Sequence[str], frame: Frame, ids: ArrayLike, means: ArrayLike
+        self,
+        *,
+        time: SupportsIndex,
+        space: Sequence[str],
+        frame: Frame,
+        ids: ArrayLike,
+        means: ArrayLike,
+        extent: ArrayLike | None = None,
+        extent_offset: ArrayLike | None = None,
+        shape: str | None = None,
     ) -> Truth:
-        """Publish the true states `means` (T, n) of the objects `ids` (T,) at `time` (ns UTC) in `frame`.
+        """Publish the true states `means` (T, n) of the objects `ids` (T,) at `time` (ns UTC) in `frame`; extent (T, 3)
+        and shape of their hulls as in `TrackPublisher.tracks`, extent_offset (T, 2) of the state's place from the
+        hull's centre, m along its heading and to the left of it.
         Raises `MessageError` for what cannot be sent, `BusError` if it is not open."""
         names = _space(space)
         states = _floats("means", means, (None, len(names)))
         if not np.isfinite(states).all():
             raise MessageError("not-finite", "a true mean is not finite")
         number = _whole("ids", ids, np.uint64)
+        hull = _maybe(_floats, "extent", extent, (None, 3))
+        offset = _maybe(_floats, "extent_offset", extent_offset, (None, 2))
+        if not (_all_sound(sound_extents, hull) and _all_sound(sound_offsets, offset)):
+            raise MessageError("extent", "an extent or its offset is not sound")
         parts = {"time": _time(time), "space": names, "frame": frame, "ids": number, "means": states}
+        parts |= {"extent": hull, "extent_offset": offset, "shape": shape}
         return self._send(Truth, truth_key(self.source, self.realm), 8, parts)
 
 
 def _maybe(convert: Callable[..., Any], name: str, value: Any, *options: Any) -> Any:
     return None if value is None else convert(name, value, *options)
+
+
+def _threes(**columns: ArrayLike | None) -> dict[str, Any]:
+    """Columns of three numbers a row."""
+    return {name: _maybe(_floats, name, column, (None, 3)) for name, column in columns.items()}
+
+
+def _all_sound(sound: Callable[[NDArray[np.float64]], NDArray[np.bool_]], column: NDArray[np.float64] | None) -> bool:
+    return column is None or bool(sound(column).all())
 
 
 def _bits(lineages: Sequence[Sequence[str]], whole: Sequence[str]) -> NDArray[np.uint8]:

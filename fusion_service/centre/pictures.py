@@ -88,6 +88,9 @@ def as_scan(message: Message, config: CentreConfig, frame: Frame | None = None) 
         kind_p=None if message.kind_p is None else message.kind_p[some],
         track_lineage=None if message.track_lineage is None else message.track_lineage[some],
         track_origin=None if message.track_origin is None else message.track_origin[some],
+        extent=None if message.extent is None else message.extent[some],
+        extent_sigma=None if message.extent_sigma is None else message.extent_sigma[some],
+        shape=message.shape,
     )
 
 
@@ -96,7 +99,7 @@ def _fits(message: GlobalTracks) -> bool:
     tracks = len(message.ids)
     total = tracks if message.counts is None else int(np.sum(message.counts))
     columns = (message.existence, message.updated, message.counts, message.identity, message.kind, message.kind_p)
-    more = (message.marks, message.track_origin, message.track_lineage)
+    more = (message.marks, message.track_origin, message.track_lineage, message.extent, message.extent_sigma)
     return (
         len(message.means) == len(message.covariances) == total
         and all(column is None or len(column) == tracks for column in (*columns, *more))

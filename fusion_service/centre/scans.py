@@ -70,6 +70,7 @@ def fits(message: Scan) -> bool:
         and all(column is None or len(column) == tracks for column in lengths)
         and (message.weights is None or len(message.weights) == total)
         and _bits_fit(message)
+        and _extents_fit(message)
         and {*map(type, texts)} <= {str, type(None)}
     )
 
@@ -77,6 +78,14 @@ def fits(message: Scan) -> bool:
 def _bits_fit(message: LocalTracks) -> bool:
     shape = len(message.ids), -(-len(message.lineage or ()) // 8)
     return message.track_lineage is None or message.track_lineage.shape == shape
+
+
+def _extents_fit(message: LocalTracks) -> bool:
+    tracks, covariances = len(message.ids), message.reference_covariances
+    columns = (message.extent, message.extent_sigma)
+    return all(column is None or column.shape == (tracks, 3) for column in columns) and (
+        covariances is None or covariances.shape == (tracks, 2, 2)
+    )
 
 
 def is_sound(info: SensorInfo) -> bool:

@@ -47,7 +47,7 @@ def forms(section: str) -> dict[str, Form]:
     found = {}
     for key, form in ROW.findall(section):
         column = re.match(r"bin (\w+)\[(.+?)\]", form)
-        triangle = column is not None and ("n+1" in column[2] or column[2] == "6")
+        triangle = column is not None and key.endswith(("covs", "covariance"))
         found[key] = Form(LETTERS[column[1]] if column else "", triangle, "optional" in form)
     return found
 

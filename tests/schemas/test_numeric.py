@@ -241,7 +241,8 @@ def broken(seed: int) -> schemas.LocalTracks:
             matrices[component, -1, 0] = matrices[component, 0, -1] = np.nan
     for track in range(len(existence)):
         existence[track] = random.choice([0.5, 0.5, 0.5, 1.5, np.nan])
-    return replace(message, means=means, covariances=matrices, existence=existence)
+    extent = random.choice([0.5, 1.0, np.nan, -1.0], (len(existence), 3)) if random.integers(2) else None
+    return replace(message, means=means, covariances=matrices, existence=existence, extent=extent)
 
 
 def test_a_message_has_the_same_faults_alone_and_among_others() -> None:

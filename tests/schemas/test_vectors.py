@@ -17,7 +17,7 @@ import schemas
 from tests.schemas.make_vectors import VECTORS, message_forms, page
 
 NAMES = sorted(path.stem for path in VECTORS.glob("*.json"))
-ATTRIBUTES = {"covs": "covariances"}
+ATTRIBUTES = {"covs": "covariances", "reference_covs": "reference_covariances"}
 
 
 def golden(name: str) -> tuple[bytes, dict[str, Any]]:

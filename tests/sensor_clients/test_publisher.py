@@ -267,3 +267,41 @@ def test_importing_it_loads_nothing_heavy() -> None:
     loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     assert "zenoh" in loaded
     assert not {"scipy", "rerun", "matplotlib", "pyarrow", "pandas"} & set(loaded)
+
+
+def test_extents_are_sent_and_unsound_ones_are_not(hub: Hub, listener: tuple[Bus, list[tuple[str, Message]]]) -> None:
+    _, got = listener
+    hulls = [[36.0, 9.6, 0.5], [np.nan] * 3]
+    said: dict[str, Any] = {
+        "extent": hulls,
+        "extent_sigma": [[1, 0.5, 0.1], [np.nan] * 3],
+        "shape": "box",
+        "reference": "antenna",
+    }
+    with TrackPublisher("radar-1", connect=hub.endpoint) as radar:
+        radar.tracks(**scan(**said, reference_covariances=[np.diag([108.0, 8.0]), np.full((2, 2), np.nan)]))
+        for bad in ([[5.0, 6.0, 0.0], hulls[1]], [[0.0, np.nan, 0.0], hulls[1]], [[1e5, 1.0, 0.0], hulls[1]]):
+            with pytest.raises(MessageError, match="track 7") as caught:
+                radar.tracks(**scan(extent=bad))
+            assert caught.value.reason == "extent"
+        for odd in ({"shape": "circle"}, {"reference": "bow"}, {"extent": [[1.0, 1.0, 0.0]]}):
+            with pytest.raises(MessageError):
+                radar.tracks(**scan(**odd))
+    with TruthPublisher("three-radars", connect=hub.endpoint) as scenario:
+        place: dict[str, Any] = {"space": ("x", "y"), "frame": SITE, "ids": [1, 2], "means": [[1, 2], [3, 4]]}
+        scenario.truth(time=5, **place, extent=hulls, extent_offset=[[-12.0, 0.0], [np.nan, np.nan]], shape="box")
+        with pytest.raises(MessageError):
+            scenario.truth(time=6, **place, extent=[[1, 2, 0], [1, 1, 0]])
+        eventually(lambda: len(got) == 2)
+    tracks, truth = (message for _, message in got)
+    assert isinstance(tracks, LocalTracks)
+    assert isinstance(truth, Truth)
+    for message in (tracks, truth):
+        assert message.extent is not None
+        np.testing.assert_array_equal(message.extent, hulls)
+        assert message.shape == "box"
+    assert tracks.reference == "antenna"
+    assert tracks.reference_covariances is not None
+    assert truth.extent_offset is not None
+    assert tracks.reference_covariances[0].tolist() == [[108, 0], [0, 8]]
+    assert truth.extent_offset[0].tolist() == [-12, 0]

@@ -69,7 +69,8 @@ def _part(mission: RecordedMission, message: Message, near: set[int]) -> Message
         return _log(message, story.track, sources)
     if isinstance(message, Truth):
         rows = np.isin(message.ids, np.array(sorted(near), dtype=np.uint64))
-        return replace(message, ids=message.ids[rows], means=message.means[rows]) if rows.any() else None
+        said = _said(message, rows)
+        return replace(message, ids=message.ids[rows], means=message.means[rows], **said) if rows.any() else None
     if message.source not in sources:
         return None
     if isinstance(message, LocalTracks):
@@ -97,12 +98,13 @@ def _global(message: GlobalTracks, track: int) -> GlobalTracks:
 COLUMNS = ("source", "epoch", "id", "influence")
 TEXTS = ("identity", "kind", "callsign")
 OPTIONAL = ("kind_p", "identity_p", "track_origin", "marks", "number", "track_lineage", "track_rule")
+EXTENTS = ("extent", "extent_sigma", "extent_offset", "reference_covariances")
 
 
-def _said(message: GlobalTracks | LocalTracks, rows: NDArray[np.bool_]) -> dict[str, Any]:
+def _said(message: GlobalTracks | LocalTracks | Truth, rows: NDArray[np.bool_]) -> dict[str, Any]:
     """The optional columns that it has, of some of its tracks."""
     found: dict[str, Any] = {}
-    for name in (*TEXTS, *OPTIONAL):
+    for name in (*TEXTS, *OPTIONAL, *EXTENTS):
         column = getattr(message, name, None)
         if column is not None:
             some = (one for one, kept in zip(column, rows.tolist(), strict=True) if kept)
