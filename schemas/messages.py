@@ -14,6 +14,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.platform import Platform
 from schemas.spaces import Coverage, Frame, Height, Motion
 
 __all__ = [
@@ -114,6 +115,7 @@ class LocalTracks(Header):
     ids (T,) u64; means (C, n); covariances (C, n, n), symmetric; counts (T,) u16 components per track and
     weights (C,) summing to 1 per track, both None for one component each; existence (T,) in [0, 1];
     updated (T,) i64 time of the last measurement; identity, kind: a text or None per track; kind_p (T,).
+    platform: where the sensor is then, and how it is turned, if it moves.
     """
 
     type: ClassVar[str] = "local_tracks"
@@ -133,6 +135,7 @@ class LocalTracks(Header):
     kind: tuple[str | None, ...] | None = None
     kind_p: Floats | None = None
     track_lineage: U8 | None = None
+    platform: Platform | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -156,7 +159,8 @@ class SensorInfo(Header):
     position (x, y, z) in `frame`, m, and its covariance (3, 3); period, initiation_delay in seconds;
     detection_probability in [0, 1] inside `coverage`; may_start: its tracks may start global tracks;
     correlation_group: sources of one group share errors (one navigation system, say); feedback: its tracker is fed
-    with fused tracks, so that its tracks hold what others have measured.
+    with fused tracks, so that its tracks hold what others have measured; heading_sigma: rad, of an error that turns all
+    its tracks about its position alike.
     """
 
     type: ClassVar[str] = "sensor_info"
@@ -169,6 +173,7 @@ class SensorInfo(Header):
     initiation_delay: float = 0.0
     may_start: bool = True
     position_covariance: Floats | None = None
+    heading_sigma: float | None = None
     correlation_group: str | None = None
     feedback: bool | None = None
 

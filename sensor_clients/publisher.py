@@ -27,6 +27,7 @@ from schemas import (
     LocalTracks,
     MessageError,
     Motion,
+    Platform,
     SensorInfo,
     Truth,
     check_name,
@@ -164,6 +165,7 @@ class TrackPublisher(_MessagePublisher):
         initiation_delay: float = 0.0,
         may_start: bool = True,
         position_covariance: ArrayLike | None = None,
+        heading_sigma: float | None = None,
         correlation_group: str | None = None,
         feedback: bool | None = None,
     ) -> SensorInfo:
@@ -179,6 +181,7 @@ class TrackPublisher(_MessagePublisher):
             "initiation_delay": initiation_delay,
             "may_start": may_start,
             "position_covariance": _maybe(_floats, "position_covariance", position_covariance, (3, 3)),
+            "heading_sigma": heading_sigma,
             "correlation_group": correlation_group,
             "feedback": feedback,
         }
@@ -203,6 +206,7 @@ class TrackPublisher(_MessagePublisher):
         kind: Sequence[str | None] | None = None,
         kind_p: ArrayLike | None = None,
         lineages: Sequence[Sequence[str]] | None = None,
+        platform: Platform | None = None,
     ) -> LocalTracks:
         """Publish T tracks that hold at `time` (ns UTC), as Gaussians or mixtures of C components in all.
 
@@ -211,7 +215,8 @@ class TrackPublisher(_MessagePublisher):
         complete: this is all the source has, an id that is not listed is gone (T = 0 is then valid).
         Optional per track: existence in [0, 1], updated (time of the last measurement, ns), identity
         ("mmsi:...", "icao:..."), kind and kind_p; lineages: of the publisher's lineage the names whose data are in each
-        track; height: where a two-dimensional source's tracks are.
+        track; height: where a two-dimensional source's tracks are. platform: where the sensor is then, and how
+        it is turned, if it moves.
         Arrays may be anything NumPy can read. `MessageError` names the track that is unsound.
         """
         names = _space(space)
@@ -230,6 +235,7 @@ class TrackPublisher(_MessagePublisher):
             "identity": None if identity is None else tuple(identity),
             "kind": None if kind is None else tuple(kind),
             "kind_p": _maybe(_floats, "kind_p", kind_p, (None,)),
+            "platform": platform,
             "track_lineage": None if lineages is None else _bits(lineages, self._lineage or ()),
         }
         return self._send(LocalTracks, local_key(self.source, "tracks", self.realm), 8, parts)

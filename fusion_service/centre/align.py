@@ -18,6 +18,7 @@ from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
+from fusion_service.centre.standing import turned
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.centre.treatment import treated
 from fusion_service.densities import Mixtures
@@ -55,6 +56,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         )
         if config.kind == "tracks":
             predicted = _shifted(treated(predicted, config.space, treatment), shift_of(intake, source))
+            predicted = turned(predicted, source, config.space, intake.frame)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
