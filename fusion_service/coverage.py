@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fusion_service.arrays import Bools, Floats
 from fusion_service.geodesy import FrameError, transform
-from schemas import Coverage, Disk, Frame, Sector, SensorInfo
+from schemas import Coverage, Disk, Frame, Platform, Polygon, Sector, SensorInfo
 
-__all__ = ["covers", "region_holds"]
+__all__ = ["at_platform", "covers", "region_holds"]
 
 
 def covers(info: SensorInfo, positions: Floats, frame: Frame) -> Bools:
@@ -25,6 +27,13 @@ def covers(info: SensorInfo, positions: Floats, frame: Frame) -> Bools:
     except FrameError:
         return np.zeros(count, dtype=np.bool_)
     return region_holds(info.coverage, means.T, info.position[:2])
+
+
+def at_platform(info: SensorInfo, platform: Platform, frame: Frame) -> SensorInfo:
+    """What a sensor says of itself, where its platform is, in `frame`; a polygon stays where it is."""
+    if isinstance(info.coverage, Polygon):
+        return info
+    return replace(info, frame=frame, position=platform.position)
 
 
 def region_holds(region: Coverage, positions: Floats, centre: tuple[float, ...] = (0.0, 0.0)) -> Bools:

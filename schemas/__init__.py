@@ -31,6 +31,7 @@ from schemas.messages import (
     Truth,
 )
 from schemas.numeric import FAULTS, check_numbers
+from schemas.platform import Platform
 from schemas.spaces import (
     COMPONENTS,
     MOTIONS,
@@ -81,6 +82,7 @@ __all__ = [
     "Message",
     "MessageError",
     "Motion",
+    "Platform",
     "Polygon",
     "Sector",
     "SensorInfo",

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from schemas.platform import Platform
 from schemas.spaces import Coverage, Frame, Height, Motion
 
 __all__ = [
@@ -118,6 +119,7 @@ class LocalTracks(Header):
     `extents`), extent_sigma (T, 3) their standard deviations; shape, of all: one of `SHAPES`, None: the first;
     reference: what of an object the means are, one of `REFERENCES`, None: the first; reference_covariances (T, 2, 2),
     m2, in x and y: how far that may lie from the object's centre, the same from report to report.
+    platform: where the sensor is then, and how it is turned, if it moves.
     """
 
     type: ClassVar[str] = "local_tracks"
@@ -142,6 +144,7 @@ class LocalTracks(Header):
     shape: str | None = None
     reference: str | None = None
     reference_covariances: Floats | None = None
+    platform: Platform | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -165,7 +168,8 @@ class SensorInfo(Header):
     position (x, y, z) in `frame`, m, and its covariance (3, 3); period, initiation_delay in seconds;
     detection_probability in [0, 1] inside `coverage`; may_start: its tracks may start global tracks;
     correlation_group: sources of one group share errors (one navigation system, say); feedback: its tracker is fed
-    with fused tracks, so that its tracks hold what others have measured.
+    with fused tracks, so that its tracks hold what others have measured; heading_sigma: rad, of an error that turns all
+    its tracks about its position alike.
     """
 
     type: ClassVar[str] = "sensor_info"
@@ -178,6 +182,7 @@ class SensorInfo(Header):
     initiation_delay: float = 0.0
     may_start: bool = True
     position_covariance: Floats | None = None
+    heading_sigma: float | None = None
     correlation_group: str | None = None
     feedback: bool | None = None
 

@@ -22,6 +22,7 @@ from schemas.messages import (
     StepLog,
     Truth,
 )
+from schemas.platform import pack_platform, read_platform
 from schemas.values import Convert
 
 __all__ = ["CLASSES", "DECISION_COLUMNS", "FIELDS", "Field"]
@@ -103,6 +104,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("complete", values.boolean),
         *_WHERE,
         _HEIGHT,
+        _plain("platform", read_platform, pack_platform, optional=True),
         _IDS,
         _column("existence", "<f8", optional=True),
         _column("updated", "<i8", optional=True),
@@ -124,6 +126,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _FRAME,
         _plain("position", _POSITION, lambda xyz: [float(part) for part in xyz]),
         _covariances("position_covariance", "position_covariance", 2, optional=True),
+        _plain("heading_sigma", values.within(0.0, math.pi), float, optional=True),
         _plain("period", values.within(1e-6, 1e9), float),
         _plain("motion", values.motion, values.pack_motion),
         _plain("coverage", values.coverage, values.pack_kind, optional=True),

@@ -5,7 +5,6 @@ It loads NumPy, MessagePack and Zenoh, nothing else.
 
 from __future__ import annotations
 
-import operator
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -13,11 +12,10 @@ from contextlib import ExitStack
 from typing import Any, Self, SupportsIndex, TypeVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from fusion_service.bus import DEFAULT_ENDPOINT, Bus, BusError, Publisher, open_bus
 from schemas import (
-    FAULTS,
     ORIGINS,
     REALM,
     Coverage,
@@ -27,21 +25,30 @@ from schemas import (
     LocalTracks,
     MessageError,
     Motion,
+    Platform,
     SensorInfo,
     Truth,
     check_name,
-    check_numbers,
-    check_space,
     encode,
     local_key,
     truth_key,
 )
 from schemas.extents import sound_extents, sound_offsets
+from sensor_clients.given import (
+    all_sound,
+    check_densities,
+    checked_space,
+    densities,
+    floats,
+    instant,
+    lineage_bits,
+    maybe,
+    objects,
+    whole,
+)
 
 __all__ = ["TrackPublisher", "TruthPublisher"]
 
-ASYMMETRY = 1e-6
-"""The most that P_ij and P_ji may differ, as a part of sqrt(P_ii P_jj)."""
 
 M = TypeVar("M", LocalTracks, LocalIntensity, SensorInfo, Truth)
 
@@ -117,7 +124,7 @@ class _MessagePublisher:
             )
             data = encode(message)
             if isinstance(message, LocalTracks | LocalIntensity):
-                _check_densities(message)
+                check_densities(message)
             channel.put(data)
             self._channels[key] = channel, seq + 1
             return message
@@ -165,6 +172,7 @@ class TrackPublisher(_MessagePublisher):
         initiation_delay: float = 0.0,
         may_start: bool = True,
         position_covariance: ArrayLike | None = None,
+        heading_sigma: float | None = None,
         correlation_group: str | None = None,
         feedback: bool | None = None,
     ) -> SensorInfo:
@@ -172,14 +180,15 @@ class TrackPublisher(_MessagePublisher):
         again whenever it changes."""
         parts = {
             "frame": frame,
-            "position": tuple(_floats("position", position, (3,)).tolist()),
+            "position": tuple(floats("position", position, (3,)).tolist()),
             "period": period,
             "motion": motion,
             "coverage": coverage,
             "detection_probability": detection_probability,
             "initiation_delay": initiation_delay,
             "may_start": may_start,
-            "position_covariance": _maybe(_floats, "position_covariance", position_covariance, (3, 3)),
+            "position_covariance": maybe(floats, "position_covariance", position_covariance, (3, 3)),
+            "heading_sigma": heading_sigma,
             "correlation_group": correlation_group,
             "feedback": feedback,
         }
@@ -209,6 +218,7 @@ class TrackPublisher(_MessagePublisher):
         shape: str | None = None,
         reference: str | None = None,
         reference_covariances: ArrayLike | None = None,
+        platform: Platform | None = None,
     ) -> LocalTracks:
         """Publish T tracks that hold at `time` (ns UTC), as Gaussians or mixtures of C components in all.
 
@@ -220,30 +230,28 @@ class TrackPublisher(_MessagePublisher):
         source's tracks are; extent (T, 3): length, width (m) and heading of the long axis (rad, from x to y), NaN where
         not known, with extent_sigma (T, 3) and shape ("ellipse", "box"); reference: what of the object a mean is
         ("centre", "antenna", "nearest", "blob"); reference_covariances (T, 2, 2), m2 in x and y: how far that may lie
-        from the centre.
+        from the centre. platform: where the sensor is then, and how it is turned, if it moves.
         Arrays may be anything NumPy can read. `MessageError` names the track that is unsound.
         """
-        names = _space(space)
+        names = checked_space(space)
         parts = {
-            "time": _time(time),
+            "time": instant(time),
             "complete": bool(complete),
             "space": names,
             "frame": frame,
-            "ids": _whole("ids", ids, np.uint64),
-            "counts": _maybe(_whole, "counts", counts, np.uint16),
-            "weights": _maybe(_floats, "weights", weights, (None,)),
-            **_densities(means, covariances, len(names)),
-            "existence": _maybe(_floats, "existence", existence, (None,)),
-            "updated": _maybe(_whole, "updated", updated, np.int64),
+            "ids": whole("ids", ids, np.uint64),
+            "counts": maybe(whole, "counts", counts, np.uint16),
+            "weights": maybe(floats, "weights", weights, (None,)),
+            **densities(means, covariances, len(names)),
+            "existence": maybe(floats, "existence", existence, (None,)),
+            "updated": maybe(whole, "updated", updated, np.int64),
             "height": height,
             "identity": None if identity is None else tuple(identity),
             "kind": None if kind is None else tuple(kind),
-            "kind_p": _maybe(_floats, "kind_p", kind_p, (None,)),
-            "track_lineage": None if lineages is None else _bits(lineages, self._lineage or ()),
-            **_threes(extent=extent, extent_sigma=extent_sigma),
-            "shape": shape,
-            "reference": reference,
-            "reference_covariances": _maybe(_floats, "reference_covariances", reference_covariances, (None, 2, 2)),
+            "kind_p": maybe(floats, "kind_p", kind_p, (None,)),
+            "platform": platform,
+            "track_lineage": None if lineages is None else lineage_bits(lineages, self._lineage or ()),
+            **objects(extent, extent_sigma, shape, reference, reference_covariances),
         }
         return self._send(LocalTracks, local_key(self.source, "tracks", self.realm), 8, parts)
 
@@ -260,13 +268,13 @@ class TrackPublisher(_MessagePublisher):
     ) -> LocalIntensity:
         """Publish an intensity (PHD) of C components: weights (C,), whose sum is the expected number, means
         (C, n), covariances (C, n, n); the rest as in `tracks`."""
-        names = _space(space)
+        names = checked_space(space)
         parts = {
-            "time": _time(time),
+            "time": instant(time),
             "space": names,
             "frame": frame,
-            "weights": _floats("weights", weights, (None,)),
-            **_densities(means, covariances, len(names)),
+            "weights": floats("weights", weights, (None,)),
+            **densities(means, covariances, len(names)),
             "height": height,
         }
         return self._send(LocalIntensity, local_key(self.source, "intensity", self.realm), 8, parts)
@@ -292,103 +300,15 @@ class TruthPublisher(_MessagePublisher):
         and shape of their hulls as in `TrackPublisher.tracks`, extent_offset (T, 2) of the state's place from the
         hull's centre, m along its heading and to the left of it.
         Raises `MessageError` for what cannot be sent, `BusError` if it is not open."""
-        names = _space(space)
-        states = _floats("means", means, (None, len(names)))
+        names = checked_space(space)
+        states = floats("means", means, (None, len(names)))
         if not np.isfinite(states).all():
             raise MessageError("not-finite", "a true mean is not finite")
-        number = _whole("ids", ids, np.uint64)
-        hull = _maybe(_floats, "extent", extent, (None, 3))
-        offset = _maybe(_floats, "extent_offset", extent_offset, (None, 2))
-        if not (_all_sound(sound_extents, hull) and _all_sound(sound_offsets, offset)):
+        number = whole("ids", ids, np.uint64)
+        hull = maybe(floats, "extent", extent, (None, 3))
+        offset = maybe(floats, "extent_offset", extent_offset, (None, 2))
+        if not (all_sound(sound_extents, hull) and all_sound(sound_offsets, offset)):
             raise MessageError("extent", "an extent or its offset is not sound")
-        parts = {"time": _time(time), "space": names, "frame": frame, "ids": number, "means": states}
+        parts = {"time": instant(time), "space": names, "frame": frame, "ids": number, "means": states}
         parts |= {"extent": hull, "extent_offset": offset, "shape": shape}
         return self._send(Truth, truth_key(self.source, self.realm), 8, parts)
-
-
-def _maybe(convert: Callable[..., Any], name: str, value: Any, *options: Any) -> Any:
-    return None if value is None else convert(name, value, *options)
-
-
-def _threes(**columns: ArrayLike | None) -> dict[str, Any]:
-    """Columns of three numbers a row."""
-    return {name: _maybe(_floats, name, column, (None, 3)) for name, column in columns.items()}
-
-
-def _all_sound(sound: Callable[[NDArray[np.float64]], NDArray[np.bool_]], column: NDArray[np.float64] | None) -> bool:
-    return column is None or bool(sound(column).all())
-
-
-def _bits(lineages: Sequence[Sequence[str]], whole: Sequence[str]) -> NDArray[np.uint8]:
-    """Which names of the whole lineage are in each track (T, ceil(L/8))."""
-    place = {name: at for at, name in enumerate(whole)}
-    bits = np.zeros((len(lineages), len(whole)), dtype=np.bool_)
-    for row, names in enumerate(lineages):
-        unknown = [name for name in names if name not in place]
-        if unknown or not names:
-            known = ", ".join(whole) or "none"
-            raise MessageError("bad-field", f"lineages: {list(names)} of track {row} are not in the lineage ({known})")
-        bits[row, [place[name] for name in names]] = True
-    return np.packbits(bits, axis=1, bitorder="little")
-
-
-def _floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> NDArray[np.float64]:
-    """float64 of `shape`, None standing for any length; an empty one may come without its other axes."""
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise MessageError("bad-field", f"{name}: {error}") from None
-    if array.size == 0 and shape[0] is None:
-        return np.zeros([length or 0 for length in shape])
-    if len(shape) != array.ndim or any(want not in (None, got) for want, got in zip(shape, array.shape, strict=True)):
-        wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        raise MessageError("length", f"{name} has shape {array.shape} where ({wanted}) belongs")
-    return array
-
-
-def _whole(name: str, value: ArrayLike, dtype: type[np.integer[Any]]) -> NDArray[Any]:
-    try:
-        array = np.asarray(value)
-    except (ValueError, TypeError, OverflowError) as error:
-        raise MessageError("bad-field", f"{name}: {error}") from None
-    limits = np.iinfo(dtype)
-    if array.ndim != 1:
-        raise MessageError("length", f"{name} has shape {array.shape} where (any) belongs")
-    if array.size and (array.dtype.kind not in "iu" or array.min() < limits.min or array.max() > limits.max):
-        raise MessageError("bad-field", f"{name}: not whole numbers from {limits.min} to {limits.max}")
-    return array.astype(dtype)
-
-
-def _time(time: SupportsIndex) -> int:
-    try:
-        return operator.index(time)
-    except TypeError:
-        raise MessageError("bad-field", f"time: {time!r} is not whole nanoseconds, as time.time_ns() is") from None
-
-
-def _space(space: Sequence[str]) -> tuple[str, ...]:
-    try:
-        return check_space(tuple(space))
-    except (ValueError, TypeError) as error:
-        raise MessageError("bad-field", f"space: {error}") from None
-
-
-def _densities(means: ArrayLike, covariances: ArrayLike, n: int) -> dict[str, Any]:
-    return {
-        "means": _floats("means", means, (None, n)),
-        "covariances": _floats("covariances", covariances, (None, n, n)),
-    }
-
-
-def _check_densities(message: LocalTracks | LocalIntensity) -> None:
-    """Refuse what the centre would, and covariances that only seem sound because one triangle is sent."""
-    codes = check_numbers([message])[0]
-    bad = np.flatnonzero(codes)
-    if len(bad):
-        row = int(bad[0])
-        what = f"track {message.ids[row]}" if isinstance(message, LocalTracks) else f"component {row}"
-        raise MessageError(FAULTS[codes[row]], f"{what} of {message.source}")
-    scale = np.sqrt(np.diagonal(message.covariances, axis1=1, axis2=2))
-    gap = np.abs(message.covariances - message.covariances.swapaxes(1, 2))
-    if not (gap <= ASYMMETRY * scale[:, :, None] * scale[:, None, :]).all():
-        raise MessageError("bad-field", f"a covariance of {message.source} is not symmetric")

@@ -17,7 +17,8 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
+from fusion_service.centre.sources import LINKS, Columns, Source, Tracks, join_tracks, no_parts
+from fusion_service.centre.standing import turned
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.centre.treatment import treated
 from fusion_service.densities import Mixtures
@@ -49,12 +50,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
             leave_out(source)
             continue
         treatment = intake.treatment(name)
-        age = np.maximum(time - table.time + treatment.clock, 0) / 1e9
-        predicted = predict_tracks(
-            table, said.motion, source.space, config.space, age, intake.frame, config.unknown_speed
-        )
-        if config.kind == "tracks":
-            predicted = _shifted(treated(predicted, config.space, treatment), shift_of(intake, source))
+        predicted = _brought(intake, source, table, time)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
@@ -88,6 +84,19 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         kin=kin,
         out=_joined(out, np.bool_),
     )
+
+
+def _brought(intake: Intake, source: Source, table: Tracks, time: int) -> Tracks:
+    """The tracks of a source at `time`, ns, in the picture's space, after its treatment, with the errors that all of
+    them have in common."""
+    config, treatment = intake.config, intake.treatment(source.name)
+    age = np.maximum(time - table.time + treatment.clock, 0) / 1e9
+    motion = intake.declared(source).motion
+    tracks = predict_tracks(table, motion, source.space, config.space, age, intake.frame, config.unknown_speed)
+    if config.kind != "tracks":
+        return tracks
+    tracks = _shifted(treated(tracks, config.space, treatment), shift_of(intake, source))
+    return turned(tracks, source, config.space, intake.frame)
 
 
 def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:

@@ -16,12 +16,14 @@ from fusion_service.arrays import from_bytes, to_bytes
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Remembered
 from fusion_service.centre.lifecycle import Picture, empty_picture
+from fusion_service.centre.places import Place
 from fusion_service.centre.restoring import fit_config
 from fusion_service.centre.sources import Source, Tracks, empty_tracks, padded
 from fusion_service.centre.words import Lexicon, Words
 from fusion_service.errors import FusionError
 from fusion_service.order import Order
 from schemas import Ecef, Enu, Frame, Local, SensorInfo, decode, encode
+from schemas.platform import pack_platform, read_platform
 
 if TYPE_CHECKING:
     from fusion_service.centre.intake import Intake
@@ -123,6 +125,7 @@ def _pack_source(source: Source) -> dict[str, Any]:
     packed["remembered"] = [to_bytes(column) for column in source.remembered]
     if source.vote is not None:
         packed["vote"] = [_pack_frame(source.vote.frame), list(source.vote.space), source.vote.time]
+    packed["places"] = [_pack_place(one) for one in source.places]
     return packed
 
 
@@ -139,6 +142,7 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
     if "vote" in packed:
         spoken, names, time = packed["vote"]
         source.vote = Vote(_unpack_frame(spoken) or Local("none"), tuple(names), time)
+    source.places = tuple(_unpack_place(one) for one in packed.get("places", []))
     source.seen = deque((kind, seq, code) for kind, seq, code in packed["seen"])
     source.seen_set = set(source.seen)
     if packed["info"] is not None:
@@ -147,6 +151,14 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
             raise CheckpointError("the checkpoint holds another message where sensor info belongs")
         source.info = info
     return source
+
+
+def _pack_place(place: Place) -> list[Any]:
+    return [place.time, _pack_frame(place.frame), pack_platform(place.platform)]
+
+
+def _unpack_place(packed: list[Any]) -> Place:
+    return Place(packed[0], _unpack_frame(packed[1]) or Local("none"), read_platform(packed[2]))
 
 
 def _pack_columns(columns: Tracks | Picture) -> dict[str, Any]:

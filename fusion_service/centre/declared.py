@@ -7,8 +7,10 @@ from dataclasses import replace
 import numpy as np
 
 from fusion_service.centre.intervals import Pace
+from fusion_service.centre.places import Place
 from fusion_service.centre.sources import Source, Tracks
 from fusion_service.config import CentreConfig, SourceConfig
+from fusion_service.coverage import at_platform
 from fusion_service.densities import Mixtures
 from schemas import Motion, SensorInfo
 
@@ -44,16 +46,17 @@ def motion_declared(said: SourceConfig, source: Source, config: CentreConfig) ->
     return said.motion if known or said.motion != usual else None
 
 
-def sensor_of(said: SourceConfig, info: SensorInfo | None) -> SensorInfo | None:
-    """The source's info with what is declared of it; None while it has none, and so no place."""
+def sensor_of(said: SourceConfig, info: SensorInfo | None, place: Place | None = None) -> SensorInfo | None:
+    """The source's info with what is declared of it, where its platform is; None while it has none, and so no place."""
     if info is None:
         return None
-    return replace(
+    declared = replace(
         info,
         coverage=said.coverage,
         detection_probability=said.detection_probability,
         initiation_delay=said.initiation_delay or 0.0,
     )
+    return declared if place is None else at_platform(declared, place.platform, place.frame)
 
 
 def pace_of(said: SourceConfig, silent: bool, measured: int, config: CentreConfig) -> Pace:

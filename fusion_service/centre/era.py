@@ -64,6 +64,7 @@ def rebase_sources(sources: Iterable[Source], time: int) -> None:
         source.tracks = rebased(source.tracks, LOCAL_TIMES, time)
         source.remembered = known._replace(time=np.minimum(known.time, time))
         source.last, source.complete = min(source.last, time), min(source.complete, time)
+        source.places = tuple(one for one in source.places if one.time <= time)
         if source.vote is not None:
             source.vote = source.vote._replace(time=min(source.vote.time, time))
 

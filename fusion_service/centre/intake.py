@@ -149,7 +149,7 @@ class Intake:
 
     def sensor(self, source: Source) -> SensorInfo | None:
         """Its info with coverage, detection probability and initiation delay as declared; None while it has none."""
-        return sensor_of(self.declared(source), source.info)
+        return sensor_of(self.declared(source), source.info, source.place)
 
     def treatment(self, name: str) -> Treatment:
         """How the tracks of a source are treated in this step."""

@@ -89,11 +89,12 @@ def _extents_fit(message: LocalTracks) -> bool:
 
 
 def is_sound(info: SensorInfo) -> bool:
-    p, covariance = info.detection_probability, info.position_covariance
+    p, covariance, sigma = info.detection_probability, info.position_covariance, info.heading_sigma
     return (
         0 < info.period <= MAX_PERIOD
         and 0 <= info.initiation_delay <= MAX_PERIOD
         and (p is None or 0 <= p <= 1)
+        and (sigma is None or 0 <= sigma <= math.pi)
         and all(math.isfinite(part) for part in info.position)
         and (covariance is None or bool(np.isfinite(covariance).all()))
     )

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Floats
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
+from fusion_service.centre.places import Place, followed
 from fusion_service.centre.words import Codes
 from fusion_service.densities import Mixtures
 from schemas import LocalTracks, SensorInfo
@@ -260,9 +261,9 @@ class Source:
 
     interval: between its scans, ns, measured (-1: not yet). remembered: its tracks that went stale. vote: the frame it
     speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason.
-    lag: how far behind the last step its messages come, ns, about the longest of late. Of the step being made:
-    arrived, the ids that came; pairs, their versions, where those are followed; ahead, the time of the newest message
-    that is for a later one.
+    lag: how far behind the last step its messages come, ns, about the longest of late. places: of its
+    newest messages that say one. Of the step being made: arrived, the ids that came; pairs, their versions, where those
+    are followed; ahead, the time of the newest message that is for a later one.
     """
 
     name: str
@@ -290,6 +291,7 @@ class Source:
     arrived: list[NDArray[np.uint64]] = field(default_factory=list)
     ahead: int = -1
     lag: int = 0
+    places: tuple[Place, ...] = ()
     pairs: list[Pair] = field(default_factory=list)
     highest: dict[str, int] = field(default_factory=dict)
     first: dict[str, int] = field(default_factory=dict)
@@ -301,8 +303,13 @@ class Source:
         self.epoch, self.info, self.waited, self.last, self.complete = epoch, None, 0, -1, -1
         self.tracks = empty_tracks(len(self.space))
         self.interval, self.remembered, self.why, self.arrived = -1, NOTHING_REMEMBERED, "", []
-        self.lag, self.pairs = 0, []
+        self.lag, self.pairs, self.places = 0, [], ()
         self.highest, self.first, self.seen, self.seen_set = {}, {}, deque(), set()
+
+    @property
+    def place(self) -> Place | None:
+        """Where it was when it last said so."""
+        return self.places[-1] if self.places else None
 
     def leave(self, reason: str, count: int) -> None:
         """Count tracks that are taken but not used."""
@@ -365,6 +372,8 @@ class Source:
                 gap = message.time - self.last
                 self.interval = follow(self.interval if self.interval > 0 else gap, gap, pace)
             self.last = max(self.last, message.time)
+            if message.platform is not None:
+                self.places = followed(self.places, Place(message.time, message.frame, message.platform))
         self.space, self.tracks = space, merged
         return True
 

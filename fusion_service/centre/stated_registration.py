@@ -1,8 +1,9 @@
 """The registration error that each source states: one shift of all it reports, by its SensorInfo or by the config.
 
-A sensor that is not sure where it stands reports every target shifted by the same unknown amount. Its SensorInfo states
-the covariance of that (`position_covariance`, in its own frame); for a source that states none the config does
-(`registration_sigma`, m, the same in x, y and z), and with `override` the config's is taken for every source.
+A sensor that is not sure where it stands reports every target shifted by the same unknown amount. Its SensorInfo, or
+the platform of its newest tracks, states the covariance of that (`position_covariance`, in its own frame); for a source
+that states none the config does (`registration_sigma`, m, the same in x, y and z), and with `override` the config's is
+taken for every source.
 """
 
 from __future__ import annotations
@@ -46,15 +47,26 @@ def shift_of(intake: Intake, source: Source) -> Floats | None:
     return out
 
 
+def _stated(source: Source) -> tuple[tuple[float, float, float], Floats, Frame] | None:
+    """Position, covariance of it and their frame as the source states them; None if it states no covariance."""
+    place, info = source.place, source.info
+    if place is not None and place.platform.position_covariance is not None:
+        return place.platform.position, place.platform.position_covariance, place.frame
+    if info is None or info.position_covariance is None:
+        return None
+    return info.position, info.position_covariance, info.frame
+
+
 def _shift(intake: Intake, source: Source, frame: Frame) -> Floats:
     """Covariance (3, 3) of a source's shift in `frame`, m2, semidefinite and bounded; a covariance in a frame that
     has no relation to it is not used."""
-    said, info = intake.declared(source), source.info
-    if said.override or info is None or info.position_covariance is None:
+    said, stated = intake.declared(source), _stated(source)
+    if said.override or stated is None:
         return np.asarray(np.eye(3) * min(said.registration_sigma, LARGEST) ** 2)
     try:
-        covariance = np.asarray(info.position_covariance, dtype=np.float64).reshape(3, 3)
-        _, turned = transform(np.array([info.position]), covariance[None], AXES, info.frame, frame)
+        position, given, own = stated
+        covariance = np.asarray(given, dtype=np.float64).reshape(3, 3)
+        _, turned = transform(np.array([position], dtype=np.float64), covariance[None], AXES, own, frame)
         values, axes = np.linalg.eigh(0.5 * (turned[0] + turned[0].T))
     except (FrameError, ValueError, np.linalg.LinAlgError):
         return np.zeros((3, 3))

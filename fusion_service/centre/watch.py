@@ -24,6 +24,7 @@ from fusion_service.centre.increments import Increments
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.partial import AXES, PLACED
 from fusion_service.centre.sources import Source
+from fusion_service.centre.standing import heading_sigma_of
 from fusion_service.centre.stated_registration import shift_of
 from schemas import Motion
 
@@ -181,7 +182,7 @@ def reason_of(intake: Intake, source: Source) -> str:
         return "feedback"
     if said.covariance_floor > 0.0:
         return "covariance_floor"
-    if shift_of(intake, source) is not None:
+    if shift_of(intake, source) is not None or heading_sigma_of(source):
         return "registration"
     if not set(source.space) <= set(intake.config.space) or _goes_unseen(source, intake.config.space, said.motion):
         return "space"

@@ -75,7 +75,15 @@ def pack(meaning: dict[str, Any], text: str) -> dict[str, Any]:
     known = message_forms(meaning["type"], text)
     order = list(known)
     assert sorted(meaning, key=order.index) == list(meaning), "keys in another order than WIRE.md's"
-    return {key: _column(known[key], value) if known[key].letter else value for key, value in meaning.items()}
+    return {
+        key: _column(known[key], value) if known[key].letter else _platform(value, text) if key == "platform" else value
+        for key, value in meaning.items()
+    }
+
+
+def _platform(value: dict[str, Any], text: str) -> dict[str, Any]:
+    known = forms(sections(text)["Platform"])
+    return {key: _column(known[key], one) if known[key].letter else one for key, one in value.items()}
 
 
 def dump(meaning: dict[str, Any], wire: dict[str, Any]) -> str:

@@ -36,6 +36,9 @@ def plain(value: Any) -> Any:
         return [value.source, value.epoch, value.seq, value.hash, value.reason, value.count]
     if isinstance(value, schemas.Motion):
         return {"kind": value.kind} | {name: plain(getattr(value, name)) for name in schemas.MOTIONS[value.kind]}
+    if isinstance(value, schemas.Platform):
+        said = {name: plain(getattr(value, name)) for name in value.__slots__}
+        return {name: one for name, one in said.items() if one is not None}
     if hasattr(value, "__slots__"):
         kind = {} if isinstance(value, schemas.Height) else {"kind": value.kind}
         return kind | {name: plain(getattr(value, name)) for name in value.__slots__}

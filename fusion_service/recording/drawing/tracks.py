@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats
 from fusion_service.colours import SCREEN_NEUTRAL, SCREEN_TRUTH, Colour, centre_colours, screen_source_colours
+from fusion_service.coverage import at_platform
 from fusion_service.recording.columns import ColumnWriter, Stamp, entity
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
 from fusion_service.recording.drawing.extent import Corners, Extent
@@ -117,6 +118,8 @@ class Drawing:
         place = self._canvas.placing.place(
             means[sound], covariances[sound], message.space, message.frame, message.height
         )
+        if message.platform is not None and message.source in self._info:
+            self.sensor(at_platform(self._info[message.source], message.platform, message.frame), stamp)
         ids = message.ids[sound]
         mass = None if message.existence is None else message.existence[sound]
         table = tabulate(message.epoch, message.time, ids, place, mass=mass)
