@@ -14,6 +14,7 @@ from fusion_service.errors import UsageError
 from fusion_service.process import argument, data_folder, exit_code, positive, stop_on_signals, whole
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
+from sensor_clients.faults import faulty, read_fault
 from sensor_clients.playback import autoferry, mrclam, radar_v2x, table
 from sensor_clients.publisher import TrackPublisher, TruthPublisher
 from sensor_clients.runner import pace
@@ -25,6 +26,7 @@ EXAMPLES = """examples:
   sensor-client list
   sensor-client simulate three-radars --sensor radar1
   sensor-client simulate three-radars --sensor radar2 --tracker imm
+  sensor-client simulate three-radars --sensor radar2 --fault clock=0.5,x=200,heading=0.3
   sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
   sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
@@ -83,6 +85,13 @@ def _parser() -> argparse.ArgumentParser:
             type=argument(check_endpoint),
             default=DEFAULT_ENDPOINT,
             help=f"the hub (default {DEFAULT_ENDPOINT})",
+        )
+        command.add_argument(
+            "--fault",
+            type=argument(read_fault),
+            metavar="NAME=NUMBER,...",
+            help="make the source wrong on purpose: clock and delay (s), x and y (m), heading (degrees), range (m), "
+            "scale, sigma (factor), loss (share), stuck (s)",
         )
         command.add_argument("--realm", default=REALM, help=f"first part of every key (default {REALM})")
         command.add_argument(
@@ -179,6 +188,8 @@ def _publish(
         events, name, kind = scenario.truth(), scenario.name, TruthPublisher
     else:
         events, name, kind = scenario.sensors[sensor](seed), sensor, TrackPublisher
+        if arguments.fault is not None:
+            events = faulty(events, arguments.fault, seed)
     if arguments.duration is not None:
         end = scenario.start + round(arguments.duration * 1e9)
         events = itertools.takewhile(lambda event: event.time <= end, events)

@@ -13,7 +13,8 @@ __all__ = ["Event", "Parameter", "Scenario"]
 
 
 class Event(NamedTuple):
-    """One message: when it is due (scenario time, int ns UTC), which publisher method says it, and with what.
+    """One message: its time (of the scenario, int ns UTC), which publisher method says it, and with what; due: when it
+    is published, where that is not its time.
 
     kind "info": fields of `schemas.SensorInfo`; "tracks", "intensity": of the publisher's method of that name
     without the time; "truth": of `TruthPublisher.truth` without the time.
@@ -22,6 +23,7 @@ class Event(NamedTuple):
     time: int
     kind: Literal["info", "tracks", "intensity", "truth"]
     fields: dict[str, Any]
+    due: int | None = None
 
 
 class Parameter(NamedTuple):

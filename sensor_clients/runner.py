@@ -32,7 +32,8 @@ def pace(
     """
     published = 0
     for event in events:
-        due = start_at + (event.time - start) * 1e-9 / speed
+        time_due = event.time if event.due is None else event.due
+        due = start_at + (time_due - start) * 1e-9 / speed
         while not stop.is_set() and (wait := due - clock()) > 0:
             stop.wait(min(wait, 1.0))
         if stop.is_set():

@@ -14,6 +14,7 @@ HELP = "A whole mission: hub, service, clients and recorder as processes, then a
 EXAMPLE = """fusion-service demo
   fusion-service demo --rule hmd-ga --json result.json
   fusion-service demo --memory tracklet
+  fusion-service demo --fault radar2:clock=0.5,heading=0.3 --set registration=correct
   fusion-service demo --scenario autoferry:2 --data DIR --speed 10
   fusion-service demo --scenario mrclam:6 --data DIR
   fusion-service demo --rule bci --set rule_options.max_correlation=0.5 --set gate=0.99"""
@@ -50,6 +51,13 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--cameras", action="store_true", help="autoferry: the bearing-only cameras too")
     parser.add_argument(
+        "--fault",
+        action="append",
+        default=[],
+        metavar="SOURCE:NAME=NUMBER,...",
+        help="make a source wrong on purpose, as `sensor-client simulate --fault` does; several times",
+    )
+    parser.add_argument(
         "--out", metavar="DIR", help="folder of the results (default runs/<scenario>-<rule>-<UTC time>)"
     )
     parser.add_argument("--json", metavar="FILE", help="write the scores here")
@@ -70,6 +78,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         seed=args.seed,
         tracker=args.tracker,
         cameras=args.cameras,
+        faults=args.fault,
         out=Path(args.out) if args.out else None,
         json_path=Path(args.json) if args.json else None,
         stop=stop,

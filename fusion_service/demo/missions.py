@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fusion_service.errors import DataError, UsageError
 from fusion_service.process import data_folder
 
-__all__ = ["AUTOFERRY", "MRCLAM", "THREE_RADARS", "MissionPlan", "plan_mission"]
+__all__ = ["AUTOFERRY", "MRCLAM", "THREE_RADARS", "MissionPlan", "plan_mission", "with_faults"]
 
 JITTER = 1.5
 """Seconds that the machine may hold a client up, and it is still waited for."""
@@ -96,3 +97,15 @@ def plan_mission(
         )
     clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
     return MissionPlan(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)
+
+
+def with_faults(plan: MissionPlan, faults: Sequence[str]) -> MissionPlan:
+    """The plan with clients made wrong, each as SOURCE:NAME=NUMBER,... says. `UsageError` for a source it has not."""
+    clients = {name: list(command) for name, command in plan.clients.items()}
+    known = [name for name in clients if name != "truth"]
+    for text in faults:
+        name, colon, fault = text.partition(":")
+        if not colon or name not in known:
+            raise UsageError(f"--fault {text}: write SOURCE:NAME=NUMBER,..., SOURCE one of {', '.join(known)}")
+        clients[name] += ["--fault", fault]
+    return replace(plan, clients=clients)

@@ -15,7 +15,7 @@ from fusion_service.config import centre_config, load_config
 from fusion_service.config.settings import change, merge
 from fusion_service.config.toml_text import dotted, toml_value
 from fusion_service.demo.crew import Crew, DemoError, client_arguments, free_endpoint, record_arguments
-from fusion_service.demo.missions import MissionPlan, plan_mission
+from fusion_service.demo.missions import MissionPlan, plan_mission, with_faults
 from fusion_service.progress import Progress
 from schemas import GlobalTracks, MessageError, decode, global_key, local_key
 
@@ -59,16 +59,17 @@ def run_demo(
     seed: int,
     tracker: str = "ckf",
     cameras: bool = False,
+    faults: Sequence[str] = (),
     out: Path | None,
     json_path: Path | None,
     stop: threading.Event,
 ) -> dict[str, Any]:
     """Fly a mission and print its scores; returns what the JSON holds, nothing if it was stopped.
 
-    changes: settings of the centre as KEY=VALUE, above all others. Raises `UsageError`, `ConfigError` or `DemoError`
-    if it cannot be flown, before anything is written or started; `DemoError` and `BusError` if it goes wrong.
+    changes: settings of the centre as KEY=VALUE, above all others; faults: SOURCE:NAME=NUMBER,... of clients. Raises
+    `UsageError`, `ConfigError` or `DemoError` if it cannot be flown, before anything is written or started; `DemoError` and `BusError` if it goes wrong.
     """
-    plan = plan_mission(scenario, data=data, seed=seed, tracker=tracker, cameras=cameras)
+    plan = with_faults(plan_mission(scenario, data=data, seed=seed, tracker=tracker, cameras=cameras), faults)
     speed = speed or plan.speed
     options = {"criterion": criterion} if criterion else {}
     settings = {"clock": "message", "rule": rule, "rule_options": options, "memory": memory, **plan.settings(speed)}
