@@ -67,7 +67,8 @@ def run_demo(
     """Fly a mission and print its scores; returns what the JSON holds, nothing if it was stopped.
 
     changes: settings of the centre as KEY=VALUE, above all others; faults: SOURCE:NAME=NUMBER,... of clients. Raises
-    `UsageError`, `ConfigError` or `DemoError` if it cannot be flown, before anything is written or started; `DemoError` and `BusError` if it goes wrong.
+    `UsageError`, `ConfigError` or `DemoError` if it cannot be flown, before anything is written or started;
+    `DemoError` and `BusError` if it goes wrong.
     """
     plan = with_faults(plan_mission(scenario, data=data, seed=seed, tracker=tracker, cameras=cameras), faults)
     speed = speed or plan.speed

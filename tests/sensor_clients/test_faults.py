@@ -81,7 +81,7 @@ def test_loss_is_about_the_share_and_the_same_for_a_seed() -> None:
     "text", ["clock", "clock=x", "bogus=1", "sigma=0", "loss=1", "clock=inf", "delay=-1", "scale=-1"]
 )
 def test_what_is_no_fault_is_refused_with_what_is_known(text: str) -> None:
-    with pytest.raises(ValueError, match="no fault|no number|finite|above 0"):
+    with pytest.raises(ValueError, match=r"no fault|no number|finite|above 0"):
         read_fault(text)
 
 
