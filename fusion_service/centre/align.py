@@ -12,6 +12,7 @@ from fusion_service import linalg
 from fusion_service.arrays import Floats
 from fusion_service.centre import kinship
 from fusion_service.centre.evidence import chi2_by_size
+from fusion_service.centre.extents import with_reference
 from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.partial import Unknown, predict_known
@@ -51,7 +52,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
             table, said.motion, source.space, config.space, age, intake.frame, config.unknown_speed
         )
         if config.kind == "tracks":
-            predicted = _shifted(predicted, shift_of(intake, source))
+            predicted = with_reference(_shifted(predicted, shift_of(intake, source)), config.space, intake.frame)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
