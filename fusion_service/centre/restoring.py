@@ -48,7 +48,7 @@ def _moved(
     tracks: Columns, space: tuple[str, ...], frame: Frame | None, wanted: Frame | None, height: Height
 ) -> Columns:
     """Tracks in `space` brought from one frame into the other, without those that cannot be."""
-    if frame is None or wanted is None or frame == wanted:
+    if frame is None or wanted is None or frame == wanted or not tracks.mean.shape[-1]:
         return tracks
     try:
         mean, covariance = _transformed(tracks.mean, tracks.covariance, space, frame, wanted, height)

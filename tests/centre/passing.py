@@ -32,9 +32,7 @@ def boats(second: float) -> NDArray[np.float64]:
     return np.array([[4.0 * (second - 30), 0.0, 4.0, 0.0], [5.5 * (second - 30), 8.0, 5.5, 0.0]])
 
 
-def passing(
-    *, camera: bool, blob: bool = False, seed: int = 1, new_id: bool = True, **config: Any
-) -> Passed:
+def passing(*, camera: bool, blob: bool = False, seed: int = 1, new_id: bool = True, **config: Any) -> Passed:
     """blob: the lidar says that its tracks may be blobs, and how large; new_id: after the pass the second boat is a new
     track of the lidar."""
     print(f"seed {seed}")
@@ -70,5 +68,3 @@ def _lidar(
 def again(made: FusionCentre) -> FusionCentre:
     """A centre that goes on from the checkpoint of another."""
     return FusionCentre(made.config, made.checkpoint())
-
-

@@ -94,7 +94,7 @@ def test_two_that_a_row_stands_for_are_not_merged_though_they_look_alike() -> No
             give(made, tracks("lidar", second, both, sigma=LIDAR, **said))
             give(made, tracks("camera", second, states[1:], [2], sigma=CAMERA))
             result = step(made, second)
-        return result.tracks.ids.tolist()
+        return [int(track) for track in result.tracks.ids]
 
     assert len(run(apart=False)) == 1, "evidence alone would merge them"
     assert len(run(apart=True)) == 2
