@@ -22,10 +22,12 @@ from schemas import Ecef, Enu, Frame, Height, Local
 
 __all__ = [
     "FrameError",
+    "axis_turn",
     "ecef_to_geodetic",
     "enu_to_geodetic",
     "geodetic_to_ecef",
     "geodetic_to_enu",
+    "level_axes",
     "surface",
     "transform",
     "vertical",
@@ -126,6 +128,37 @@ def vertical(means: Floats, space: tuple[str, ...], frame: Enu | Ecef) -> Floats
         place = [centre[i] + axes[0, i] * x + axes[1, i] * y + axes[2, i] * z for i in range(3)]
         normal, _ = _normal_and_altitude(*place)
         return np.stack([_dot(list(row), normal) for row in axes])
+
+
+def level_axes(means: Floats, space: tuple[str, ...], frame: Enu | Ecef) -> tuple[Floats, Floats]:
+    """East and north (3, B), of length 1 in the axes of `frame`, at the places of states (n, B) of `space`; without z
+    those on the plane z = 0. NaN at the poles."""
+    axes, _ = _axes(frame)
+    x, y = (means[space.index(name)] for name in "xy")
+    z = means[space.index("z")] if "z" in space else np.zeros_like(x)
+    up, pole = vertical(np.stack([x, y, z]), ("x", "y", "z"), frame), axes[:, 2]
+    with np.errstate(all="ignore"):
+        east = _cross(list(pole), list(up))
+        length = np.sqrt(_dot(east, east))
+        east = [part / length for part in east]
+    return np.stack(east), np.stack(_cross(list(up), east))
+
+
+def axis_turn(means: Floats, space: tuple[str, ...], source: Frame, target: Frame) -> Floats:
+    """By how much (B,), rad, a heading in `source` grows when it is told in `target`, at the places of states (n, B) in
+    `target`: headings count from x to y, in an ECEF frame from east to north. That the planes of two ENU frames are
+    tilted against each other is left out: (distance / Earth radius)^2 / 4 at most. 0 where nothing relates them."""
+    if source == target or isinstance(source, Local) or isinstance(target, Local):
+        return np.zeros(means.shape[1:])
+    east, north = level_axes(means, space, target)
+    to_axes, _ = _axes(target)
+    x = east if isinstance(source, Ecef) else (to_axes @ _axes(source)[0][0])[:, None] + np.zeros_like(east)
+    along = (_dot(x, east), _dot(x, north)) if isinstance(target, Ecef) else (x[0], x[1])
+    return np.nan_to_num(np.arctan2(along[1], along[0]))
+
+
+def _cross(a: list[Floats], b: list[Floats]) -> list[Floats]:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
 
 
 def _check(space: tuple[str, ...], source: Frame, target: Frame) -> None:

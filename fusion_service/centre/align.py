@@ -12,6 +12,7 @@ from fusion_service import linalg
 from fusion_service.arrays import Floats
 from fusion_service.centre import kinship
 from fusion_service.centre.evidence import chi2_by_size
+from fusion_service.centre.extents import with_reference
 from fusion_service.centre.intake import MAX_TOTAL, Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.partial import Unknown, predict_known
@@ -96,7 +97,7 @@ def _brought(intake: Intake, source: Source, table: Tracks, time: int) -> Tracks
     if config.kind != "tracks":
         return tracks
     tracks = _shifted(treated(tracks, config.space, treatment), shift_of(intake, source))
-    return turned(tracks, source, config.space, intake.frame)
+    return with_reference(turned(tracks, source, config.space, intake.frame), config.space, intake.frame)
 
 
 def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:

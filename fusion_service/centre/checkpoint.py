@@ -176,6 +176,9 @@ def _unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
         empty = getattr(like, one.name)
         blank = np.full(count, MISSING.get(one.name, 0)).astype(empty.dtype)
         flat = blank if one.name not in packed else from_bytes(packed[one.name], empty)
+        if one.name == "extent":
+            held = len(flat) // max(count, 1) if one.name in packed else 0
+            empty, flat = np.zeros((held, 0)), flat[: held * count]
         arrays.append(flat.reshape(*empty.shape[:-1], count))
     return type(like)(*arrays)
 

@@ -12,8 +12,9 @@ each and their sum bounded by `MOST`.
   `false_track`, the chance that a report of a track of it is of nothing.
 * A complete scan of a source that covers the place and has no new datum of the track is evidence, log(1 - p), once per
   scan received (the Bernoulli filter's r' = r (1 - p) / (1 - r p)), after the track has been in its coverage for its
-  initiation delay; what a source has missed is made good first by its own new data, and at once by its opinion. Where
-  coverage or detection probability is not declared, nothing is lowered.
+  initiation delay, and but for a track that another row of it stands for as well (`blobs`); what a source has missed
+  is made good first by its own new data, and at once by its opinion. Where coverage or detection probability is not
+  declared, nothing is lowered.
 * Without any new datum the target may be gone: r' = r s^dt, s the `survival` of a second.
 """
 
@@ -27,6 +28,7 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats
 from fusion_service.centre.association import by_size
+from fusion_service.centre.blobs import Shared
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown
@@ -103,8 +105,11 @@ class Entries:
         return made
 
 
-def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entries, time: int, before: int) -> Picture:
-    """The picture with existence at the step at `time`, ns, the last one having been at `before` (-1: none)."""
+def update_existence(
+    rows: Rows, picture: Picture, intake: Intake, entries: Entries, time: int, before: int, shared: Shared
+) -> Picture:
+    """The picture with existence at the step at `time`, ns, the last one having been at `before` (-1: none). shared:
+    which rows stand for a second track."""
     config, count = intake.config, len(picture.id)
     inside = rows.inside()
     at = picture.find(rows.tracks.link[inside])
@@ -117,7 +122,7 @@ def update_existence(rows: Rows, picture: Picture, intake: Intake, entries: Entr
     gain = np.array([_gain(intake.declared(intake.sources[name])) for name in intake.names()])
     counted = fresh & ~says
     np.add.at(evidence, at[counted], gain[rows.source[inside[counted]]])
-    missed, spent = _missed(rows, picture, intake, entries, gain, time)
+    missed, spent = _missed(rows, picture, intake, entries, gain, time, shared)
     evidence = evidence - spent
     evidence = np.clip(opinion + evidence, -MOST, MOST) - opinion
     if before >= 0:
@@ -163,7 +168,7 @@ def _gain(declared: SourceConfig) -> float:
 
 
 def _missed(
-    rows: Rows, picture: Picture, intake: Intake, entries: Entries, gain: Floats, time: int
+    rows: Rows, picture: Picture, intake: Intake, entries: Entries, gain: Floats, time: int, shared: Shared
 ) -> tuple[Floats, Floats]:
     """What all scans that show nothing new of a track, so far, take from its log-odds (G,); and how much of the gain
     (N,) of new data only made good what their own sources had missed. An opinion of a source makes good all of it."""
@@ -190,6 +195,7 @@ def _missed(
         says = np.isin(picture.id, rows.tracks.link[new & np.isfinite(rows.tracks.existence)])
         unsure = np.isin(picture.id, rows.tracks.link[mine & rows.tracks.outside])
         missed = covered & ~seen & ~unsure & (time - since >= said.initiation_delay * 1e9)
+        missed = shared.still_missed(index[name], missed)
         p = min(float(said.detection_probability or 0.0), MOST_CERTAIN)
         more = intake.sources[name].scans * np.log1p(-p)
         again = seen & ~says & (total < 0)

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
+from fusion_service.centre.blobs import Blobs, Shared
 from fusion_service.centre.centre import Centre
 from fusion_service.centre.existence import Entries, update_existence
+from fusion_service.centre.extent_fusion import fused_extents
+from fusion_service.centre.extents import shaped
 from fusion_service.centre.lifecycle import Picture, Support
 from fusion_service.centre.linking import Linker
 from fusion_service.centre.meeting import Meeting
@@ -41,6 +44,7 @@ class FusionCentre(Centre):
     def _begin(self) -> None:
         self._linker = Linker(self.config, self._ids)
         self._entries = Entries()
+        self._blobs = Blobs(self.config)
         self._memory = Memory(self._intake)
         self._supervisor = Supervisor(self._intake)
         self._last = -1
@@ -51,11 +55,14 @@ class FusionCentre(Centre):
             "entries": self._entries.packed(),
             "memory": self._memory.packed(),
             "supervision": self._supervisor.packed(),
+            "blobs": self._blobs.packed(),
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
         self._linker.restore(state)
         self._entries = Entries.unpacked(state["entries"])
+        if "blobs" in state:
+            self._blobs.restore(state["blobs"])
         if "memory" in state:
             self._memory.restore(state["memory"])
         self._supervisor.restore(state.get("supervision", {}))
@@ -63,6 +70,7 @@ class FusionCentre(Centre):
 
     def _rebase(self, time: int) -> None:
         self._linker.merges.rebase(time)
+        self._blobs.rebase(time)
         self._memory.rebase(time)
         self._supervisor.rebase(time)
         self._last = min(self._last, time)
@@ -70,8 +78,11 @@ class FusionCentre(Centre):
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         now = self._associate(rows, names, time)
         self._supervisor.observe(rows, names, now, self._step, time, self._journal)
+        shared = self._blobs.follow(rows, names, now, time, self._intake.frame)
+        rows = shared.widened()
         self._picture, influence = self._memory.fuse(rows, names, self._picture, now, self._step, time, self._journal)
-        self._live(rows, time)
+        self._picture = fused_extents(rows, self._picture, (time - self._last) / 1e9 if self._last >= 0 else 0.0)
+        self._live(rows, shared, time)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
 
@@ -106,8 +117,11 @@ class FusionCentre(Centre):
         """Decide the links of the step; the picture that comes of it, predicted to `time`."""
         now = self._memory.motions.predicted(self._picture, time)
         count = len(now.id)
-        meeting = Meeting(self._intake, self._labels, rows, now.id, names)
-        self._picture, merged = self._linker.link(rows, self._picture, now, meeting, self._step, time, self._journal)
+        meeting = Meeting(self._intake, self._labels, rows, now.id, names, self._blobs.unmerged)
+        seen = shaped(rows, now, self.config.space, self._intake.frame)
+        self._picture, merged = self._linker.link(
+            seen[0], self._picture, seen[1], meeting, self._step, time, self._journal
+        )
         self._relink(merged)
         if merged:
             gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
@@ -115,7 +129,7 @@ class FusionCentre(Centre):
             count = len(now.id)
         return now.join(self._picture.take(slice(count, None)))
 
-    def _live(self, rows: Rows, time: int) -> None:
+    def _live(self, rows: Rows, shared: Shared, time: int) -> None:
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()
         at = picture.find(tracks.link[inside])
         rows = kinship.new_only(rows, picture.updated, at, inside)
@@ -124,15 +138,17 @@ class FusionCentre(Centre):
         np.maximum.at(newest, at, tracks.time[inside])
         seen = np.maximum(picture.seen, newest)
         picture = replace(picture, updated=updated, seen=seen)
-        picture = update_existence(rows, picture, self._intake, self._entries, time, self._last)
-        support = self._support(rows, inside, at, len(picture.id), time)
+        picture = update_existence(rows, picture, self._intake, self._entries, time, self._last, shared)
+        support = self._support(rows, shared, inside, at, len(picture.id), time)
         self._last = time
         picture, ended = live_on(picture, time, support, self.config, self._journal)
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
         tracks.link[np.isin(tracks.link, picture.id[ended])] = NO_TRACK
         self._picture = picture.take(~ended)
 
-    def _support(self, rows: Rows, inside: NDArray[np.intp], at: NDArray[np.intp], count: int, time: int) -> Support:
+    def _support(
+        self, rows: Rows, shared: Shared, inside: NDArray[np.intp], at: NDArray[np.intp], count: int, time: int
+    ) -> Support:
         """What feeds each global track. A report is overdue by half of its interval, or a step, whichever is longer;
         where the source's token is gone, by nothing."""
         interval = rows.interval[inside]
@@ -145,7 +161,9 @@ class FusionCentre(Centre):
         sources = np.bincount(at[(expected >= time) & counted], minlength=count)
         hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
         linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
-        return Support(sources, hit, due, slowest, linked == 0, self._last)
+        whole = np.full(len(rows.source), -1, dtype=np.int64)
+        whole[inside] = expected
+        return Support(sources, hit, due, slowest, shared.support(due, whole, linked == 0), self._last)
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()

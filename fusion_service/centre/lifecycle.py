@@ -39,7 +39,7 @@ class Picture:
     overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
     existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; lineage i32 code of the sources
     whose data are in the density (-1: not known); motion i32 code (see `motions`); way u8 index into `WAYS` of what
-    it was last fused by.
+    it was last fused by; extent (E, G), fused, E = 0 where nothing is known of any (see `extents`).
     """
 
     id: NDArray[np.uint64]
@@ -63,6 +63,7 @@ class Picture:
     motion: NDArray[np.int32]
     way: NDArray[np.uint8]
     lineage: NDArray[np.int32]
+    extent: NDArray[np.float64]
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
@@ -113,6 +114,7 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
         motion=np.full(count, -1, dtype=np.int32),
         way=np.zeros(count, dtype=np.uint8),
         lineage=np.full(count, NOBODY, dtype=np.int32),
+        extent=np.zeros((0, count)),
     )
 
 

@@ -25,20 +25,27 @@ Ids = NDArray[np.uint64]
 Mask = NDArray[np.bool_]
 
 
+NOBODY: Ids = np.zeros((0, 2), dtype=np.uint64)
+
+
 class Meeting:
-    """For the rows and the global tracks (ids, sorted) of one step; names: all sources, sorted.
+    """For the rows and the global tracks (ids, sorted) of one step; names: all sources, sorted; unmerged (K, 2): ids of
+    tracks that are not to be merged in it.
 
     held (M,): rows that neither start nor join a track. forced_row, forced_track (L,): pairs to be linked, gate or
     no gate. compartment_of_rows (M,), compartment_of_tracks (G,): those of different ones are no pair. Links are
     those that the rows have when this is made.
     """
 
-    def __init__(self, intake: Intake, labels: Labels, rows: Rows, ids: Ids, names: tuple[str, ...]) -> None:
+    def __init__(
+        self, intake: Intake, labels: Labels, rows: Rows, ids: Ids, names: tuple[str, ...], unmerged: Ids = NOBODY
+    ) -> None:
         self._rows, self._ids, self._identities = rows, ids, labels.identities
         self._orders = constraints(intake.orders, rows, names)
         self.compartment_of_rows = labels.compartments.of_rows(rows, names)
         self.compartment_of_tracks = labels.compartments.of_tracks(ids, rows, names)
         self.held = self._orders.held
+        self._separate = [*self._orders.separate.tolist(), *unmerged.tolist()]
         there = np.isin(self._orders.forced_track, ids)
         self.forced_row, self.forced_track = self._orders.forced_row[there], self._orders.forced_track[there]
 
@@ -88,9 +95,9 @@ class Meeting:
         if both.any():
             schemes = self._identities.schemes()
             forbidden |= both & (schemes[code[a]] == schemes[code[b]]) & (code[a] != code[b])
-        if len(self._orders.separate):
+        if self._separate:
             low, high = np.minimum(self._ids[a], self._ids[b]), np.maximum(self._ids[a], self._ids[b])
-            for first, second in self._orders.separate.tolist():
+            for first, second in self._separate:
                 forbidden |= (low == np.uint64(first)) & (high == np.uint64(second))
         return forbidden
 

@@ -17,6 +17,7 @@ from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size
 from fusion_service.centre.correlation import AUTO, declared_correlation, declared_motions, sound_rows
 from fusion_service.centre.derived import Derived, Followed
+from fusion_service.centre.extents import off_centre
 from fusion_service.centre.fusing import fuse_all, with_parts
 from fusion_service.centre.increments import Increments, increments
 from fusion_service.centre.intake import Intake
@@ -113,7 +114,7 @@ class Memory:
             return None
         chosen = self._config.rule != AUTO
         trusted = [chosen or self.watch.records[name].reason not in UNTRUE for name in names]
-        sound = ruled & sound_rows(rows) & kinship.alone(self._intake, rows)
+        sound = ruled & sound_rows(rows) & kinship.alone(self._intake, rows) & ~off_centre(rows, self._config.space)
         sound &= np.array(trusted, dtype=np.bool_)[rows.source]
         noise = SharedNoise(declared_motions(self._intake), self._config.space)
         followed = self.derived.follow(rows, names, versions, noise, sound, time)
@@ -124,7 +125,8 @@ class Memory:
     def _capable(self, rows: Rows, names: tuple[str, ...]) -> Bools:
         """Rows (M,) whose versions may be taken as tracklets."""
         sources = np.array([not self.watch.records[name].reason for name in names], dtype=np.bool_)
-        return sources[rows.source] & sound_rows(rows) & ~self._unseen(rows, names) & kinship.alone(self._intake, rows)
+        sources = sources[rows.source] & ~off_centre(rows, self._config.space)
+        return sources & sound_rows(rows) & ~self._unseen(rows, names) & kinship.alone(self._intake, rows)
 
     def _unseen(self, rows: Rows, names: tuple[str, ...]) -> Bools:
         """Rows (M,) of a place whose velocity is not known, as of a source that does not tell it (see `watch`)."""

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre.extent_fusion import extent_columns
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.labels import Labels
@@ -95,6 +96,7 @@ def picture_message(
         ended=journal.ended(),
         split_from=journal.splits(),
         **_ways(picture, rule),
+        **extent_columns(picture),
         **labels.columns(picture.id, origin),
     )
 

@@ -9,20 +9,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import fields, replace
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
+from fusion_service.centre.extents import turned
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown, brought, transformed
 from fusion_service.centre.rows import NO_TRACK
-from fusion_service.centre.sources import Columns, Source, empty_tracks
+from fusion_service.centre.sources import Source, Tracks, empty_tracks
 from fusion_service.config import CentreConfig
 from fusion_service.geodesy import FrameError
 from schemas import Frame, Height
 
 __all__ = ["fit_config"]
+
+Columns = TypeVar("Columns", Tracks, Picture)
 
 
 def fit_config(
@@ -44,7 +48,7 @@ def _moved(
     tracks: Columns, space: tuple[str, ...], frame: Frame | None, wanted: Frame | None, height: Height
 ) -> Columns:
     """Tracks in `space` brought from one frame into the other, without those that cannot be."""
-    if frame is None or wanted is None or frame == wanted:
+    if frame is None or wanted is None or frame == wanted or not tracks.mean.shape[-1]:
         return tracks
     try:
         mean, covariance = _transformed(tracks.mean, tracks.covariance, space, frame, wanted, height)
@@ -52,6 +56,7 @@ def _moved(
     except FrameError:
         return _taken(tracks, np.zeros(tracks.mean.shape[-1], dtype=np.bool_))
     tracks = replace(tracks, mean=mean, covariance=covariance, part_mean=parts[0], part_covariance=parts[1])
+    tracks = turned(tracks, space, frame, wanted)
     columns = mean, covariance, parts[0]
     sound = [np.isfinite(column.reshape(-1, column.shape[-1])).all(axis=0) for column in columns]
     return _taken(tracks, np.logical_and.reduce(sound))

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats
+from fusion_service.centre.extents import message_extents
 from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.partial import transformed
 from fusion_service.centre.sources import Tracks, no_parts, unlinked
@@ -130,6 +131,7 @@ def message_tracks(
         mean, covariance = mixtures.moments()
         parts = mixtures.log_weights, mixtures.means, linalg.symmetrise(mixtures.covariances)
     counts = [int(rows.sum()) for rows in sound]
+    extent = message_extents(messages, sound, mean, frame)
     times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
     updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
     existence = [np.full(len(m.ids), np.nan) if m.existence is None else m.existence for m in messages]
@@ -146,6 +148,7 @@ def message_tracks(
         interval=np.zeros(len(times), dtype=np.int64),
         **_told(messages, sound, said),
         lineage=_gather([lineages.of_message(m) for m in messages], sound),
+        extent=extent,
         **unlinked(len(times)),
     )
 

@@ -24,6 +24,8 @@ from fusion_service.densities import Mixtures
 from schemas import LocalTracks, SensorInfo
 
 __all__ = [
+    "EXTENT_ROWS",
+    "FUSED_ROWS",
     "LINKS",
     "REMEMBERED",
     "Columns",
@@ -43,6 +45,8 @@ __all__ = [
 
 Columns = TypeVar("Columns", bound="HasParts")
 
+EXTENT_ROWS, FUSED_ROWS = 11, 7
+"""Numbers of an extent: as a local track says it, and fused (see `extents`)."""
 REMEMBERED = 1024
 MOST_GAPS = 2**62
 """Messages of one source whose exact repeat is recognised; older ones are too late to matter."""
@@ -79,7 +83,8 @@ class Tracks:
     the others in the track when evidence was last added; data i64 how many were judged in this link; evidence f64 sum
     for the link; outside: the newest datum failed its gate; shadow u64 global id that it is a second track of, or 0;
     apart f64 sum for that; told i64 `updated` of the version whose identity and class the global track has heard;
-    lineage i32 code of the sources whose data it contains (-1: its source alone).
+    lineage i32 code of the sources whose data it contains (-1: its source alone); extent (E, T), what is said of the
+    object's extent, E = 0 where nothing is of any (see `extents`).
     """
 
     id: NDArray[np.uint64]
@@ -97,6 +102,7 @@ class Tracks:
     kind_p: NDArray[np.float64]
     origin: NDArray[np.uint8]
     lineage: NDArray[np.int32]
+    extent: NDArray[np.float64]
     link: NDArray[np.uint64]
     since: NDArray[np.int64]
     used: NDArray[np.int64]
@@ -159,6 +165,7 @@ def empty_tracks(n: int) -> Tracks:
         kind_p=real,
         origin=np.zeros(0, dtype=np.uint8),
         lineage=code,
+        extent=np.zeros((0, 0)),
         **unlinked(0),
     )
 
@@ -189,13 +196,24 @@ def no_parts(n: int, count: int) -> tuple[Floats, Floats, Floats]:
 
 
 def join_tracks(parts: Sequence[Columns]) -> Columns:
-    """One after the other; where some hold components, all get them."""
+    """One after the other; where some hold components, or an extent, all get them."""
     most = max(len(part.log_weight) for part in parts)
     if any(len(part.log_weight) != most for part in parts):
         parts = [padded(part, most) for part in parts]
     first = parts[0]
+    if len({len(getattr(part, "extent", ())) for part in parts}) > 1:
+        parts = [_with_extents(part) for part in parts]
     names = [one.name for one in fields(first)]
     return type(first)(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names))
+
+
+def _with_extents(tracks: Columns) -> Columns:
+    """The same with room for extents, nothing being said of them."""
+    extent = getattr(tracks, "extent")  # noqa: B009
+    if len(extent):
+        return tracks
+    rows = EXTENT_ROWS if isinstance(tracks, Tracks) else FUSED_ROWS
+    return replace(tracks, extent=np.full((rows, extent.shape[-1]), np.nan))
 
 
 def as_mixtures(tracks: HasParts, rows: Any) -> Mixtures:
