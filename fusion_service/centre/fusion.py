@@ -63,6 +63,7 @@ class FusionCentre(Centre):
 
     def _rebase(self, time: int) -> None:
         self._linker.merges.rebase(time)
+        self._linker.copies.rebase(time)
         self._memory.rebase(time)
         self._supervisor.rebase(time)
         self._last = min(self._last, time)
@@ -77,9 +78,11 @@ class FusionCentre(Centre):
 
     def _watched(self) -> dict[str, dict[str, Any]]:
         watch, wanted = self._memory.watch, self.config.by_tracklets
+        copies = self._linker.copies.sentences()
         return {
             name: {key: value for key, value in watch.health(name).items() if wanted or "tracklets" not in key}
             | self._supervisor.health(name)
+            | ({"copies": copies[name]} if name in copies else {})
             for name in self._intake.names()
         }
 
