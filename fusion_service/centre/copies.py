@@ -109,8 +109,8 @@ class Copies:
     ) -> None:  # fmt: skip
         """Tell what begins and what is over. asked: the rows that were free in this step; of the others those stay
         that are there, without a link, and their track is."""
-        say = np.flatnonzero((rows.tracks.link == NO_TRACK) & (rows.tracks.identity != NONE)) if self.held else []
-        loose = {meeting.key_of(int(one)) for one in say}
+        say = np.flatnonzero((rows.tracks.link == NO_TRACK) & (rows.tracks.identity != NONE))
+        loose = {meeting.key_of(one) for one in say.tolist()} if self.held else set()
         there = set(now.id.tolist()) if self.held else set()
         quiet = {
             key: copy for key, copy in self.held.items() if key not in asked and key in loose and copy.track in there

@@ -73,6 +73,7 @@ class FusionCentre(Centre):
         self._supervisor.observe(rows, names, now, self._step, time, self._journal)
         self._picture, influence = self._memory.fuse(rows, names, self._picture, now, self._step, time, self._journal)
         self._live(rows, time)
+        self._supervisor.conduct.judge_existence(rows, self._picture, self._entries, time, self._journal)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
 
