@@ -247,4 +247,4 @@ def _sentence(number: int, copy: Copy) -> str:
     if abs(copy.behind) > 0.8 * copy.away:
         side, late = ("behind", "late") if copy.behind > 0 else ("ahead", "early")
         return begin + f"{abs(copy.behind):.0f} m {side} along its course: {abs(copy.delay):.1f} s {late}?"
-    return begin + f"{copy.away:.0f} m away: is it turned or shifted, or is one of the two false?"
+    return begin + f"{copy.away:.3g} m away: is it turned or shifted, or is one of the two false?"

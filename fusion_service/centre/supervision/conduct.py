@@ -1,8 +1,9 @@
 """Spoofed or stuck sources: alarms with their evidence.
 
     stuck           tracks repeat to the bit (see `moves`), new versions with new measurements, though they claim a
-                    speed that would have taken them further than three sigma; or the whole feed does, whose states
-                    varied before, of objects that do not say what they are (a ship at anchor says it, and repeats)
+                    speed that would have taken them further than three sigma; or all tracks of a source do, two at
+                    least, from one moment on, each of which was new every time before. One alone may be of an object
+                    that stops, seen by a sensor that rounds; a ship at anchor says what it is, and is not counted
     jump            the tracks of a source jump together, or a track that says what it is jumps, or one again and again
     unseen          a track that only this source has, though two others at least cover the place and have missed it
                     beyond doubt (their scans without it: 10^-6 and less)
@@ -40,8 +41,8 @@ __all__ = ["Conduct"]
 
 FEW = 5
 """New versions in a row that are as before, to the bit."""
-VARIED = 3
-"""New versions of a track that were not, for it to be one that varies."""
+VARIED = 10
+"""New versions of a track in a row that were not, for it to be one that varies."""
 AGAIN = 3
 """Jumps of one track, or new data of a pair with one identity, that raise an alarm."""
 TOGETHER = 0.8
@@ -122,8 +123,9 @@ class Conduct:
         before = self._before[source.name].tracks
         first = before.time[np.searchsorted(before.id, tracks.id[at])]
         new["since"][at] = np.where(found.again & (new["repeats"][at] > 0), new["since"][at], first)
+        ended = new["repeats"][at] > 0
         new["repeats"][at] = np.where(found.again, new["repeats"][at] + 1, 0)
-        new["varied"][at] += ~found.again
+        new["varied"][at] = np.where(found.again, new["varied"][at], np.where(ended, 1, new["varied"][at] + 1))
         recent = time - new["last"] <= HOLD * 1e9
         new["jumps"][~recent] = 0
         jumped = at[found.jumped]
@@ -152,9 +154,9 @@ class Conduct:
             )
             self._warnings.raised((source.name, "stuck", ""), time, numbers, sentence, journal)
             return
-        unnamed = tracks.identity[at] == NONE
-        frozen = (repeats >= FEW) & (new["varied"][at] >= VARIED)
-        if unnamed.any() and frozen[unnamed].all() and (repeats >= FEW).all():
+        counted = at[tracks.identity[at] == NONE]
+        frozen = (new["varied"][counted] >= VARIED) & (new["since"][counted] == new["since"][counted[:1]])
+        if len(counted) > 1 and frozen.all() and (repeats >= FEW).all():
             numbers = {"tracks": len(at), "of_tracks": len(at), "seconds": float(seconds.max())}
             sentence = (
                 f"all its {len(at)} tracks repeat to the bit for {seconds.max():.0f} s, and varied before: "
