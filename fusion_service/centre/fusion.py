@@ -71,6 +71,7 @@ class FusionCentre(Centre):
     def _rebase(self, time: int) -> None:
         self._linker.merges.rebase(time)
         self._blobs.rebase(time)
+        self._linker.copies.rebase(time)
         self._memory.rebase(time)
         self._supervisor.rebase(time)
         self._last = min(self._last, time)
@@ -83,14 +84,17 @@ class FusionCentre(Centre):
         self._picture, influence = self._memory.fuse(rows, names, self._picture, now, self._step, time, self._journal)
         self._picture = fused_extents(rows, self._picture, (time - self._last) / 1e9 if self._last >= 0 else 0.0)
         self._live(rows, shared, time)
+        self._supervisor.conduct.judge_existence(rows, self._picture, self._entries, time, self._journal)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
 
     def _watched(self) -> dict[str, dict[str, Any]]:
         watch, wanted = self._memory.watch, self.config.by_tracklets
+        copies = self._linker.copies.sentences()
         return {
             name: {key: value for key, value in watch.health(name).items() if wanted or "tracklets" not in key}
             | self._supervisor.health(name)
+            | ({"copies": copies[name]} if name in copies else {})
             for name in self._intake.names()
         }
 

@@ -150,6 +150,17 @@ class Identities:
         forbidden[said] = other & (trust >= TRUSTED)
         return Terms(ratio, forbidden)
 
+    def trusted_rows(self, rows: Rows, some: Ints) -> tuple[Ints, Codes]:
+        """Of some rows those that say, from a source that is trusted, what they are, in order, and what (codes)."""
+        said, _, code = self._trusted(rows, some)
+        return said, code
+
+    def trusted_tracks(self) -> tuple[Ids, Codes]:
+        """The tracks that are believed to be something, `TRUSTED` or more, and what (codes); one may stand twice."""
+        code, p = self.identity.best(OPEN)
+        sure = p >= TRUSTED
+        return self.identity.track[sure], code[sure]
+
     def contradicted(self, rows: Rows, linked: Ints, sure: Ints) -> Ints:
         """Of the linked rows those that are trusted to be another object than a row of the same track, which stays:
         one of `sure`, else one that says what the track is believed to be, else the one that was linked first."""

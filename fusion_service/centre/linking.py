@@ -22,6 +22,7 @@ from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.births import group
 from fusion_service.centre.candidates import Candidates, find_candidates
+from fusion_service.centre.copies import Copies
 from fusion_service.centre.evidence import LOW, PairEvidence, RivalLinks, Tests
 from fusion_service.centre.gating import Judgement, Settings, judge
 from fusion_service.centre.ids import Ids
@@ -53,6 +54,7 @@ class Linker:
         self.tests = Tests.of(config)
         self.merges = PairEvidence()
         self.rivals = RivalLinks()
+        self.copies = Copies(config)
         self._ids = ids
         self._settings = Settings(self.tests, config.space, config.manoeuvre)
         n = len(config.space)
@@ -73,7 +75,10 @@ class Linker:
         near = _without_broken(near, rows, now, judged)
         joined = self._assign(rows, now, _vacant(near, meeting), step, journal)
         merged = self._merge(rows, now, near, step, journal)
+        if not merged:
+            merged = self.copies.joined(rows, now, near, meeting, step, time, journal)
         free = near.loose[rows.tracks.link[near.loose] == NO_TRACK]
+        free = free[~self.copies.hold(rows, now, near, meeting, free, time, journal)]
         starting = self._shadow(rows, now, near, meeting, free)
         picture = self._begin(rows, picture, near, free, starting, step, time, journal)
         newly = np.concatenate([joined, free[rows.tracks.link[free] != NO_TRACK]])
@@ -279,11 +284,13 @@ class Linker:
 
     def packed(self) -> dict[str, Any]:
         """The evidence as plain values."""
-        return {"merges": self.merges.packed(), "rivals": self.rivals.packed()}
+        packed = {"merges": self.merges.packed(), "rivals": self.rivals.packed()}
+        return packed | {"copies": self.copies.packed()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on with what `packed` gave."""
         self.merges, self.rivals = PairEvidence.unpacked(state["merges"]), RivalLinks.unpacked(state["rivals"])
+        self.copies.restore(state.get("copies", {}))
 
 
 def _vacant(near: Candidates, meeting: Meeting) -> Candidates:

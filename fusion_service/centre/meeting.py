@@ -16,13 +16,15 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import set_links
-from fusion_service.centre.words import NONE
+from fusion_service.centre.words import NONE, Codes
 from schemas import messages
 
 __all__ = ["Meeting"]
 
 Ids = NDArray[np.uint64]
 Mask = NDArray[np.bool_]
+MOST_NAMESAKES = 4
+"""Tracks that are trusted to be one and the same thing, which a row that says so is compared with."""
 
 
 NOBODY: Ids = np.zeros((0, 2), dtype=np.uint64)
@@ -40,7 +42,8 @@ class Meeting:
     def __init__(
         self, intake: Intake, labels: Labels, rows: Rows, ids: Ids, names: tuple[str, ...], unmerged: Ids = NOBODY
     ) -> None:
-        self._rows, self._ids, self._identities = rows, ids, labels.identities
+        self._rows, self._ids, self._identities, self._names = rows, ids, labels.identities, names
+        self._said = intake.said.identity
         self._orders = constraints(intake.orders, rows, names)
         self.compartment_of_rows = labels.compartments.of_rows(rows, names)
         self.compartment_of_tracks = labels.compartments.of_tracks(ids, rows, names)
@@ -107,3 +110,46 @@ class Meeting:
         source, width = self._rows.source, max(len(self._ids), 1)
         keys = source[self.forced_row] * width + np.searchsorted(self._ids, self.forced_track)
         return np.isin(source[row] * width + at, keys) & ~np.isin(row, self.forced_row)
+
+    def key_of(self, row: int) -> tuple[str, int, int]:
+        """Source, epoch and local id of a row."""
+        rows = self._rows
+        return self._names[int(rows.source[row])], int(rows.epoch[row]), int(rows.tracks.id[row])
+
+    def identity_texts(self, code: Codes) -> list[str]:
+        """Identities by code."""
+        return [text or "" for text in self._said.said(code)]
+
+    def namesakes(self, row: Ints) -> tuple[Ints, Ints, Codes]:
+        """Pairs (K,) of one of these rows and a global track (its place in `ids`) that both are trusted to be the same
+        thing, and may be; of each thing the `MOST_NAMESAKES` oldest tracks. And what that is."""
+        said, code = self._identities.trusted_rows(self._rows, row)
+        if not len(said):
+            return said, said, code
+        track, of = self._known()
+        low, high = np.searchsorted(of, code, "left"), np.searchsorted(of, code, "right")
+        many = np.minimum(high - low, MOST_NAMESAKES)
+        pair = np.repeat(np.arange(len(said)), many)
+        place = np.repeat(low - (np.cumsum(many) - many), many) + np.arange(len(pair))
+        mine, at = said[pair], track[place]
+        allowed = ~self.with_tracks(mine, at).forbidden & ~self.held[mine]
+        return mine[allowed], at[allowed], code[pair][allowed]
+
+    def namesake_tracks(self, most: int) -> tuple[Ints, Ints]:
+        """Pairs (K,) of global tracks (places in `ids`) that are trusted to be the same thing, and may be: the oldest
+        with each other one; at most so many."""
+        track, of = self._known()
+        oldest = track[np.searchsorted(of, of, "left")] if len(of) else track
+        other = np.flatnonzero(track != oldest)[:most]
+        first, second = oldest[other], track[other]
+        allowed = ~self.of_tracks(first, second)
+        return first[allowed], second[allowed]
+
+    def _known(self) -> tuple[Ints, Codes]:
+        """The global tracks (places in `ids`) that are trusted to be something, by code and then by age; and the
+        codes."""
+        ids, code = self._identities.trusted_tracks()
+        there = np.isin(ids, self._ids)
+        at, code = np.searchsorted(self._ids, ids[there]), code[there]
+        order = np.lexsort((at, code))
+        return at[order], code[order]

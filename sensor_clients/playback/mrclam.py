@@ -9,7 +9,8 @@ Each robot knows its place by odometry and landmarks alone and tracks the robots
 both in the correlation group "robotN":
 
     robotN        the others. The error of its own place, common to them all, is in the SensorInfo, which is sent again
-                  as it changes; what its heading adds is in the covariances.
+                  as it changes, and beside its place in the `platform` of each message; what its heading adds, which
+                  goes with the error of the place, is in the covariances.
     robotN-self   itself, one track. Its covariance is the whole: a source of its own, so that nothing is added to it.
 
 Both report at full seconds, and say nothing while the robot does not know its place.
@@ -18,6 +19,7 @@ Both report at full seconds, and say nothing while the robot does not know its p
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -26,11 +28,11 @@ from typing import Any
 import numpy as np
 
 from fusion_service.errors import DataError
-from schemas import Local
+from schemas import Local, Platform
 from sensor_clients.events import Event, Parameter, Scenario
 from sensor_clients.filters.measurement import STATE, Floats
 from sensor_clients.playback.own_place import OwnPlace, Pose
-from sensor_clients.playback.robot import MRCLAM
+from sensor_clients.playback.robot import MRCLAM, wrapped
 from sensor_clients.playback.sighted import Others, Seen
 
 __all__ = ["FRAME", "PARAMETERS", "ROBOTS", "SENSORS", "SETS", "SUMMARY", "Recorded", "load", "read"]
@@ -157,7 +159,7 @@ def seen_events(recorded: Recorded, start: int, end: int, seed: int = 0) -> Iter
             told = pose.mean, common
             yield Event(time, "info", _info(recorded.number, pose.mean, common))
         seen = robot.others.report(time, told[1])
-        yield Event(time, "tracks", _tracks(seen))
+        yield Event(time, "tracks", _tracks(seen) | {"platform": _platform(pose.mean, told[1])})
 
 
 def self_events(recorded: Recorded, start: int, end: int, seed: int = 0) -> Iterator[Event]:
@@ -176,7 +178,7 @@ def self_events(recorded: Recorded, start: int, end: int, seed: int = 0) -> Iter
             yield Event(time, "info", _info(recorded.number, pose.mean, None))
         now, mean, covariance = np.array([time]), state[0][None], state[1][None]
         own = Seen(np.array([epoch], dtype=np.uint64), [recorded.number], mean, covariance, now)
-        yield Event(time, "tracks", _tracks(own))
+        yield Event(time, "tracks", _tracks(own) | {"platform": _platform(pose.mean, None)})
 
 
 def _tracks(seen: Seen) -> dict[str, Any]:
@@ -190,6 +192,18 @@ def _tracks(seen: Seen) -> dict[str, Any]:
         "updated": seen.updated,
         "identity": tuple(f"robot:{subject}" for subject in seen.subjects),
     }
+
+
+def _platform(pose: Floats, common: Floats | None) -> Platform:
+    """Where the robot is; its heading, counted from x to y, as one that is counted from +y clockwise."""
+    place = float(pose[0]), float(pose[1]), 0.0
+    return Platform(place, None if common is None else _flat(common), wrapped(math.pi / 2 - float(pose[2])))
+
+
+def _flat(common: Floats) -> Floats:
+    P = np.zeros((3, 3))
+    P[:2, :2] = common
+    return P
 
 
 def _changed(told: tuple[Floats, Floats], now: tuple[Floats, Floats]) -> bool:
@@ -209,8 +223,7 @@ def _info(number: int, pose: Floats, common: Floats | None) -> dict[str, Any]:
         "correlation_group": f"robot{number}",
     }
     if common is not None:
-        fields["position_covariance"] = np.zeros((3, 3))
-        fields["position_covariance"][:2, :2] = common
+        fields["position_covariance"] = _flat(common)
     return fields
 
 

@@ -1,0 +1,315 @@
+"""Spoofed or stuck sources: alarms with their evidence.
+
+    stuck           tracks repeat to the bit (see `moves`), new versions with new measurements, though they claim a
+                    speed that would have taken them further than three sigma; or all tracks of a source do, two at
+                    least, from one moment on, each of which was new every time before. One alone may be of an object
+                    that stops, seen by a sensor that rounds; a ship at anchor says what it is, and is not counted
+    jump            the tracks of a source jump together, or a track that says what it is jumps, or one again and again
+    unseen          a track that only this source has, though two others at least cover the place and have missed it
+                    beyond doubt (their scans without it: 10^-6 and less)
+    identity-twice  the source has one identity in two places
+    two-runs        two runs of one source speak at once: every other message is older than the last
+    older-run       the same, of which one says that it began earlier: what it sends is refused (old-epoch)
+
+Alarms change no result by themselves: they stand in log and status, and `alarmed` tells the states of sources of all
+but the last kind: refused messages are not in a recording, and what changes a result must be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.arrays import Ints, from_bytes, to_bytes
+from fusion_service.centre.existence import Entries
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.journal import Journal
+from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.rows import Rows
+from fusion_service.centre.sources import Source
+from fusion_service.centre.stated_registration import shift_of
+from fusion_service.centre.supervision.moves import Moves, Snapshot, moves
+from fusion_service.centre.supervision.warnings import HOLD, Warnings
+from fusion_service.centre.words import NONE
+
+__all__ = ["Conduct"]
+
+FEW = 5
+"""New versions in a row that are as before, to the bit."""
+VARIED = 10
+"""New versions of a track in a row that were not, for it to be one that varies."""
+AGAIN = 3
+"""Jumps of one track, or new data of a pair with one identity, that raise an alarm."""
+TOGETHER = 0.8
+"""Share of the tracks of a source that jump when the source does."""
+FAR = 50.0
+"""d2 of two places from which one identity is twice."""
+DOUBT = float(np.log(1e6))
+SEEN = 20.0
+"""Seconds for which a source has reported what nobody else sees: what comes of clutter is gone by then."""
+MOST_TWICE = 50
+REFUSED = "older-run"
+COLUMNS: dict[str, type[np.generic]] = {
+    "id": np.uint64, "repeats": np.int64, "varied": np.int64, "since": np.int64, "jumps": np.int64, "last": np.int64,
+}  # fmt: skip
+
+
+@dataclass(slots=True)
+class _Record:
+    """Of one source. columns, each (T,) by id: repeats in a row, versions that varied, time of the first version of
+    those that repeat, jumps within the last seconds, time of the last of them. twice: new data of identities in two
+    places. old: messages of an older run, and reordered ones, in the last seconds, of how many."""
+
+    columns: dict[str, NDArray[Any]] = field(
+        default_factory=lambda: {name: np.zeros(0, kind) for name, kind in COLUMNS.items()}
+    )
+    twice: dict[str, int] = field(default_factory=dict)
+    old: float = 0.0
+    reordered: float = 0.0
+    messages: float = 0.0
+    counted: list[int] = field(default_factory=lambda: [0, 0])
+    time: int = -1
+
+
+class Conduct:
+    """How every source behaves."""
+
+    def __init__(self, intake: Intake) -> None:
+        self._intake = intake
+        self._records: dict[str, _Record] = {}
+        self._before: dict[str, Snapshot] = {}
+        self._refused: dict[str, int] = {}
+        self._alone: dict[int, int] = {}
+        self._warnings = Warnings()
+        self._places = [intake.config.space.index(axis) for axis in ("x", "y", "z") if axis in intake.config.space]
+
+    def observe(self, rows: Rows, names: tuple[str, ...], time: int, journal: Journal) -> None:
+        """Look at what came in with the step at `time`, ns."""
+        if self._intake.config.supervision == "off":
+            return
+        self._records = {name: self._records.get(name, _Record()) for name in names}
+        for name in names:
+            source, record = self._intake.sources[name], self._records[name]
+            before = self._before.get(name)
+            if source.arrived and before is not None and before.tracks is not source.tracks:
+                shift = shift_of(self._intake, source)
+                some = [] if shift is None else [float(shift[k, k]) for k in self._places]
+                found = moves(
+                    before, source, self._intake.frame, float(np.sqrt(max(some, default=0.0))), self._intake.config
+                )
+                self._stuck_and_jumps(source, record, found, time, journal)
+                self._twice(source, record, found, time, journal)
+            self._runs(source, record, time, journal)
+        self._snapshot()
+
+    def _snapshot(self) -> None:
+        self._before = {name: Snapshot.of(one, self._intake.frame) for name, one in self._intake.sources.items()}
+
+    def _stuck_and_jumps(self, source: Source, record: _Record, found: Moves, time: int, journal: Journal) -> None:
+        tracks, old = source.tracks, record.columns
+        new = {name: np.zeros(len(tracks.id), kind) for name, kind in COLUMNS.items()}
+        new["id"] = tracks.id
+        if len(old["id"]):
+            place = np.minimum(np.searchsorted(old["id"], tracks.id), len(old["id"]) - 1)
+            known = old["id"][place] == tracks.id
+            for name in COLUMNS:
+                new[name][known] = old[name][place[known]]
+        at = found.at
+        before = self._before[source.name].tracks
+        first = before.time[np.searchsorted(before.id, tracks.id[at])]
+        new["since"][at] = np.where(found.again & (new["repeats"][at] > 0), new["since"][at], first)
+        ended = new["repeats"][at] > 0
+        new["repeats"][at] = np.where(found.again, new["repeats"][at] + 1, 0)
+        new["varied"][at] = np.where(found.again, new["varied"][at], np.where(ended, 1, new["varied"][at] + 1))
+        recent = time - new["last"] <= HOLD * 1e9
+        new["jumps"][~recent] = 0
+        jumped = at[found.jumped]
+        new["jumps"][jumped] += 1
+        new["last"][jumped] = time
+        record.columns = new
+        if len(at):
+            self._stuck(source, new, found, time, journal)
+        if len(jumped):
+            self._jumped(source, new, found, time, journal)
+
+    def _stuck(
+        self, source: Source, new: dict[str, NDArray[Any]], found: Moves, time: int, journal: Journal
+    ) -> None:  # fmt: skip
+        tracks, at = source.tracks, found.at
+        repeats, seconds = new["repeats"][at], (tracks.time[at] - new["since"][at]) / 1e9
+        travelled = found.speed * seconds
+        claims = (repeats >= FEW) & (travelled > 3.0 * found.sigma)
+        if claims.any():
+            worst = int(np.flatnonzero(claims)[travelled[claims].argmax()])
+            numbers = {"tracks": int(claims.sum()), "of_tracks": len(at), "id": int(tracks.id[at[worst]]),
+                       "seconds": float(seconds[worst]), "speed": float(found.speed[worst])}  # fmt: skip
+            sentence = (
+                f"{numbers['tracks']} of its {len(at)} tracks repeat to the bit (track {numbers['id']} for "
+                f"{seconds[worst]:.0f} s at {found.speed[worst]:.1f} m/s): is the feed frozen?"
+            )
+            self._warnings.raised((source.name, "stuck", ""), time, numbers, sentence, journal)
+            return
+        counted = at[tracks.identity[at] == NONE]
+        frozen = (new["varied"][counted] >= VARIED) & (new["since"][counted] == new["since"][counted[:1]])
+        if len(counted) > 1 and frozen.all() and (repeats >= FEW).all():
+            numbers = {"tracks": len(at), "of_tracks": len(at), "seconds": float(seconds.max())}
+            sentence = (
+                f"all its {len(at)} tracks repeat to the bit for {seconds.max():.0f} s, and varied before: "
+                f"is the feed frozen?"
+            )
+            self._warnings.raised((source.name, "stuck", ""), time, numbers, sentence, journal)
+
+    def _jumped(
+        self, source: Source, new: dict[str, NDArray[Any]], found: Moves, time: int, journal: Journal
+    ) -> None:  # fmt: skip
+        tracks, some = source.tracks, np.flatnonzero(found.jumped)
+        count, whole = len(some), len(found.at)
+        away = float(np.sort(found.away[some])[count // 2])
+        if count > 1 and count >= TOGETHER * whole:
+            numbers: dict[str, Any] = {"tracks": count, "of_tracks": whole, "metres": away}
+            sentence = f"{count} of its {whole} tracks jumped at once, by {away:.0f} m: its place, clock or numbers?"
+            self._warnings.raised((source.name, "jump", ""), time, numbers, sentence, journal)
+            return
+        named = tracks.identity[found.at[some]] != NONE
+        often = new["jumps"][found.at[some]] >= AGAIN
+        for k in some[named | often][:MOST_TWICE].tolist():
+            number, metres = int(tracks.id[found.at[k]]), float(found.away[k])
+            sentence = f"its track {number} jumped by {metres:.0f} m, further than anything moves"
+            numbers = {"id": number, "metres": metres, "jumps": int(new["jumps"][found.at[k]])}
+            self._warnings.raised((source.name, "jump", str(number)), time, numbers, sentence, journal)
+
+    def _twice(self, source: Source, record: _Record, found: Moves, time: int, journal: Journal) -> None:
+        """One identity in two tracks of one source, neither overdue, and one with new data."""
+        tracks = source.tracks
+        recent = source.last - tracks.time <= tracks.interval + tracks.interval // 2
+        named = np.flatnonzero((tracks.identity != NONE) & recent)
+        code = tracks.identity[named]
+        order = np.argsort(code, kind="stable")
+        same = np.flatnonzero(code[order][1:] == code[order][:-1])[:MOST_TWICE]
+        seen: dict[str, int] = {}
+        if len(same):
+            one, two = named[order][same], named[order][same + 1]
+            places = [source.space.index(axis) for axis in ("x", "y", "z") if axis in source.space]
+            some = np.ix_(places, places)
+            spread = tracks.covariance[some][..., one] + tracks.covariance[some][..., two]
+            offset = tracks.mean[places][:, one] - tracks.mean[places][:, two]
+            far = linalg.quadratic(spread, offset)
+            metres = np.sqrt((offset * offset).sum(axis=0))
+            texts = self._intake.said.identity.said(tracks.identity[one])
+            for k in np.flatnonzero(far > FAR).tolist():
+                text = texts[k] or ""
+                new = bool(np.isin([one[k], two[k]], found.at).any())
+                seen[text] = record.twice.get(text, 0) + new
+                if new and seen[text] >= AGAIN:
+                    ids = [int(tracks.id[one[k]]), int(tracks.id[two[k]])]
+                    numbers = {"identity": text, "ids": ids, "metres": float(metres[k])}
+                    sentence = f"it has {text} twice: its tracks {ids[0]} and {ids[1]}, {metres[k]:.0f} m apart"
+                    self._warnings.raised((source.name, "identity-twice", text), time, numbers, sentence, journal)
+        record.twice = seen
+
+    def _runs(self, source: Source, record: _Record, time: int, journal: Journal) -> None:
+        """Whether two runs of one source speak at once: counts of the last seconds, forgotten with time constant
+        `HOLD`."""
+        known = journal.refused_of.get(source.name)
+        refused = 0 if known is None else known["old-epoch"]
+        more = refused - self._refused.get(source.name, 0)
+        self._refused[source.name] = refused
+        gone = max(time - record.time, 0) / 1e9 if record.time >= 0 else 0.0
+        stays = float(np.exp(-gone / HOLD))
+        messages, reordered = (
+            max(now - was, 0) for now, was in zip((source.messages, source.reordered), record.counted, strict=True)
+        )
+        record.counted, record.time = [source.messages, source.reordered], time
+        record.old = record.old * stays + more
+        record.reordered, record.messages = record.reordered * stays + reordered, record.messages * stays + messages
+        if more and record.old >= AGAIN and source.last >= 0:
+            sentence = "an older run of it goes on beside the newer one: do two clients have its name?"
+            numbers = {"refused": round(record.old, 3)}
+            self._warnings.raised((source.name, REFUSED, ""), time, numbers, sentence, journal)
+        elif reordered and record.reordered >= FEW and record.reordered >= 0.4 * record.messages:
+            sentence = "every other message of it is older than the last: do two clients have its name?"
+            numbers = {"reordered": round(record.reordered, 3), "messages": round(record.messages, 3)}
+            self._warnings.raised((source.name, "two-runs", ""), time, numbers, sentence, journal)
+
+    def judge_existence(self, rows: Rows, picture: Picture, entries: Entries, time: int, journal: Journal) -> None:
+        """After existence was brought to the step at `time`, ns: tracks of one source that others deny; and alarms
+        that are over."""
+        if self._intake.config.supervision == "off":
+            return
+        for at, name, doubt, others in self._denied(rows, picture, entries):
+            track = int(picture.id[at])
+            numbers = {"track": track, "evidence": round(doubt, 3), "others": others}
+            begun = self._alone.get(track, time)
+            if time - begun >= SEEN * 1e9:
+                sentence = f"only it has track {track}, which {others} others should see and do not"
+                self._warnings.raised((name, "unseen", str(track)), time, numbers, sentence, journal)
+        self._warnings.settle(time, journal)
+
+    def _denied(self, rows: Rows, picture: Picture, entries: Entries) -> list[tuple[int, str, float, int]]:
+        """Global tracks (their place) of one source alone, that other sources have missed: how surely, and how many
+        of these there are."""
+        names = self._intake.names()
+        inside = rows.linked()
+        count = len(picture.id)
+        at = picture.find(rows.tracks.link[inside])
+        low, high = np.full(count, len(names)), np.full(count, -1)
+        np.minimum.at(low, at, rows.source[inside])
+        np.maximum.at(high, at, rows.source[inside])
+        alone = (low == high) & (high >= 0)
+        if not alone.any() or len(entries.by_source) < 2:
+            self._alone = {}
+            return []
+        total, others = np.zeros(count), np.zeros(count, dtype=np.intp)
+        for number, name in enumerate(names):
+            if name in entries.by_source:
+                since, missed = entries.of(name, picture)
+                other = (low != number) & (since >= 0)
+                total = total + np.where(other, missed, 0.0)
+                others += other & (missed < 0)
+        sure: Ints = np.flatnonzero(alone & (others > 1) & (total <= -DOUBT))
+        born = dict(zip(picture.id[sure].tolist(), picture.born[sure].tolist(), strict=True))
+        self._alone = {track: min(self._alone.get(track, time), time) for track, time in born.items()}
+        return [(int(k), names[int(low[k])], float(total[k]), int(others[k])) for k in sure.tolist()]
+
+    def alarmed(self, name: str) -> str:
+        """What an alarm that stands says of a source; "" where none does."""
+        return next(iter(self._warnings.of(name, but=REFUSED)), "")
+
+    def health(self, name: str) -> dict[str, Any]:
+        """What the status says of a source."""
+        return {"alarms": self._warnings.of(name)}
+
+    def rebase(self, time: int) -> None:
+        """A new era begins at `time`, ns: nothing was seen later."""
+        self._warnings.rebase(time)
+        for record in self._records.values():
+            record.time = min(record.time, time)
+            for name in ("since", "last"):
+                record.columns[name] = np.minimum(record.columns[name], time)
+        self._alone = {track: min(since, time) for track, since in self._alone.items()}
+        self._snapshot()
+
+    def packed(self) -> dict[str, Any]:
+        """As plain values. What the tables of sources hold is in the checkpoint already."""
+        records = {
+            name: [
+                [to_bytes(one.columns[column]) for column in COLUMNS], one.twice, one.old, one.reordered, one.messages,
+                one.counted, one.time,
+            ]
+            for name, one in sorted(self._records.items())
+        }  # fmt: skip
+        return {"records": records, "alone": sorted(self._alone.items()), "warnings": self._warnings.packed()}
+
+    def restore(self, packed: Mapping[str, Any]) -> None:
+        """From what `packed` gave."""
+        for name, (columns, *rest) in packed.get("records", {}).items():
+            read = (from_bytes(one, np.zeros(0, kind)) for one, kind in zip(columns, COLUMNS.values(), strict=True))
+            self._records[str(name)] = _Record(dict(zip(COLUMNS, read, strict=True)), *rest)
+        self._alone = {int(track): int(since) for track, since in packed.get("alone", [])}
+        self._warnings.restore(packed.get("warnings", []))
+        self._snapshot()

@@ -1,0 +1,103 @@
+"""What the tracks of one source did between two steps: new versions, those that stand still to the bit, and those that
+jumped.
+
+A version is new when it holds later and says that a measurement came in. It **repeats** when its mean and covariance
+are those of the one before to the last bit. An anchored ship's AIS does so for days, and so does a track without a
+measurement; a state with a speed does not, and nor does what a filter makes of measurements with noise.
+
+It has **jumped** when the place is further from where the last one led than
+
+    5 sigma + 3 manoeuvre dt^2 / 2  (+ 3 unknown_speed dt where it has no velocity),
+
+sigma that of both versions and of the velocity over dt, with the shift that the source states. That is asked only where
+the id went on without a pause: numbers are used again.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service.arrays import Bools, Floats
+from fusion_service.centre.partial import Unknown
+from fusion_service.centre.sources import Source, Tracks
+from fusion_service.config import CentreConfig
+from schemas import Frame
+
+__all__ = ["Moves", "Snapshot", "moves"]
+
+AXES = (("x", "vx"), ("y", "vy"), ("z", "vz"))
+SIGMAS = 5.0
+TIMES = 3.0
+PAUSE = 3.0
+"""Intervals of a track, beyond which its id may be another object's."""
+
+
+class Snapshot(NamedTuple):
+    """The table of a source as it was after a step."""
+
+    epoch: int
+    space: tuple[str, ...]
+    frame: Frame | None
+    tracks: Tracks
+
+    @classmethod
+    def of(cls, source: Source, frame: Frame | None) -> Snapshot:
+        return cls(source.epoch, source.space, frame, source.tracks)
+
+
+class Moves(NamedTuple):
+    """Of the K new versions, in order of id: at (K,), their place in the table; again (K,), as before to the bit;
+    speed (K,), m/s, what they claim, 0 where they claim none; sigma (K,), m, of the place; jumped (K,); away (K,), m,
+    from where the last one led."""
+
+    at: NDArray[np.intp]
+    again: Bools
+    speed: Floats
+    sigma: Floats
+    jumped: Bools
+    away: Floats
+
+
+def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, config: CentreConfig) -> Moves:
+    """What the tracks of `source` did since `old`; shift: m, one sigma of what the source states of its place."""
+    new = source.tracks
+    none = np.zeros(0)
+    whole = np.zeros(0, dtype=np.intp)
+    nothing = Moves(whole, none > 0, none, none, none > 0, none)
+    if (old.epoch, old.space, old.frame) != (source.epoch, source.space, frame) or not len(old.tracks.id):
+        return nothing
+    place = np.minimum(np.searchsorted(old.tracks.id, new.id), len(old.tracks.id) - 1)
+    before = old.tracks
+    later = (before.id[place] == new.id) & (new.time > before.time[place]) & (new.updated > before.updated[place])
+    later &= before.origin[place] == new.origin
+    at = np.flatnonzero(later)
+    if not len(at):
+        return nothing
+    was, now = place[at], at
+    x, y = before.mean[:, was], new.mean[:, now]
+    P, R = before.covariance[:, :, was], new.covariance[:, :, now]
+    again = (x == y).all(axis=0) & (P == R).all(axis=(0, 1))
+    dt = (new.time[now] - before.time[was]) / 1e9
+    known = Unknown.of(source.space).known(P)
+    away, spread, speed, sigma, moved = (np.zeros(len(at)) for _ in range(5))
+    for axis, rate in AXES:
+        if axis not in source.space:
+            continue
+        k = source.space.index(axis)
+        v, dv = np.zeros(len(at)), np.full(len(at), (TIMES * config.unknown_speed / SIGMAS) ** 2)
+        if rate in source.space:
+            i = source.space.index(rate)
+            v, dv = np.where(known[i], x[i], 0.0), np.where(known[i], P[i, i], dv)
+        counts = known[k]
+        away += np.where(counts, (y[k] - x[k] - v * dt) ** 2, 0.0)
+        spread += np.where(counts, P[k, k] + R[k, k] + dv * dt**2 + 2.0 * shift**2, 0.0)
+        sigma += np.where(counts, R[k, k], 0.0)
+        speed += v**2
+    moved = np.sqrt(away)
+    far = SIGMAS * np.sqrt(spread) + TIMES * config.manoeuvre * dt**2 / 2
+    held = dt <= PAUSE * np.maximum(before.interval[was], 1) / 1e9
+    jumped = held & (moved > far) & np.isfinite(far)
+    return Moves(at, again, np.sqrt(speed), np.sqrt(sigma), jumped, moved)
