@@ -16,6 +16,7 @@ __all__ = [
     "MOST_NUMBER",
     "MOST_TEXT",
     "NEEDED",
+    "STATES",
     "WHAT",
     "LocalId",
     "Order",
@@ -41,9 +42,12 @@ WHAT = {
     "quarantine": "track a source apart: its tracks are fused with no other's",
     "release": "fuse them again",
     "drop": "forget the tracks of a source now",
+    "supervise": "settle how far a source is trusted, or let the centre judge it again (state auto)",
     "withdraw": "take a standing order back, by its number",
 }
 """The orders there are, and what each means."""
+STATES = ("trusted", "watch", "inflated", "union", "out")
+"""How far a source may be trusted, from as it is to not at all."""
 _SOURCE, _LOCAL = ("source",), ("local",)
 NEEDED = {
     **dict.fromkeys(("mute", "unmute", "quarantine", "release", "drop"), _SOURCE),
@@ -51,6 +55,7 @@ NEEDED = {
     "delete": ("track",),
     "rename": ("track",),
     "identify": ("track", "identity"),
+    "supervise": ("source", "state"),
     "withdraw": ("number",),
     "link": ("track", "local"),
     "merge": ("track", "other"),
@@ -78,6 +83,7 @@ ABOUT = {
     "identify": ("track", "identity"),
     "delete": (),
     **dict.fromkeys(("mute", "quarantine"), ("source",)),
+    "supervise": ("source", "state"),
 }
 """The orders that stand, and what of an order does (with who, why, until and number)."""
 
@@ -86,11 +92,11 @@ ABOUT = {
 class Order:
     """An operator's order, one of `WHAT`.
 
-    source: whom mute, unmute, quarantine, release and drop are about. track: the global id it is about; other: a
-    second one (merge: the one that ends). local: a local track; against: a second one (never-link). name, shown,
-    identity: what rename and identify give. number: the order's own (withdraw: that of another), 0 lets the
-    centre count. who gave it, why, until when it stands (ns; None: until what it is about ends). refused: why it
-    was refused before it came to the centre, which then only logs it.
+    source: whom mute, unmute, quarantine, release, drop and supervise are about. track: the global id it is about;
+    other: a second one (merge: the one that ends). local: a local track; against: a second one (never-link). name,
+    shown, identity: what rename and identify give. state: what supervise settles, one of `STATES` or auto. number: the
+    order's own (withdraw: that of another), 0 lets the centre count. who gave it, why, until when it stands (ns; None:
+    until what it is about ends). refused: why it was refused before it came to the centre, which then only logs it.
     """
 
     what: str
@@ -107,6 +113,7 @@ class Order:
     identity: str = ""
     withdrawn: int = 0
     number: int = 0
+    state: str = ""
     refused: str = ""
 
     def stripped(self) -> Order:
@@ -181,7 +188,7 @@ def _local(value: Any) -> LocalId:
 
 _U64 = _whole(2**64)
 _READERS: dict[str, Any] = {
-    **dict.fromkeys(("what", "source", "who", "why", "name", "identity", "refused"), _text),
+    **dict.fromkeys(("what", "source", "who", "why", "name", "identity", "state", "refused"), _text),
     **dict.fromkeys(("track", "other"), _U64),
     **dict.fromkeys(("local", "against"), _local),
     **dict.fromkeys(("until", "withdrawn"), _whole(2**63)),

@@ -41,6 +41,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     interval: list[NDArray[np.int64]] = []
     lost: list[NDArray[np.bool_]] = []
     out: list[NDArray[np.bool_]] = []
+    union: list[NDArray[np.bool_]] = []
     gates: list[NDArray[np.float64]] = []
     kept: dict[str, int] = {}
     room = MAX_TOTAL // max(len(intake.sources), 1)
@@ -63,6 +64,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         epochs.append(np.full(count, max(source.epoch, 0), dtype=np.uint64))  # -1: nothing was heard of it yet
         starts.append(np.full(count, said.may_start and not treatment.out, dtype=np.bool_))
         out.append(np.full(count, treatment.out, dtype=np.bool_))
+        union.append(np.full(count, treatment.union, dtype=np.bool_))
         interval.append(table.interval[sound])
         lost.append(np.full(count, source.alive is False, dtype=np.bool_))
         gate = config.gate if said.gate is None else said.gate
@@ -84,6 +86,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         kept=kept,
         kin=kin,
         out=_joined(out, np.bool_),
+        union=_joined(union, np.bool_),
     )
 
 

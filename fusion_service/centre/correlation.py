@@ -32,8 +32,8 @@ __all__ = ["AUTO", "Correlation", "Ways", "declared_correlation", "declared_moti
 
 AUTO = "auto"
 Ways = NDArray[np.uint8]
-BY_CROSS, BY_DERIVED, BY_DECLARED, BY_CI = (
-    WAYS.index(way) for way in ("bar-shalom-campo derived", "bci derived", "bci declared", "ci")
+BY_CROSS, BY_DERIVED, BY_DECLARED, BY_CI, BY_UNION = (
+    WAYS.index(way) for way in ("bar-shalom-campo derived", "bci derived", "bci declared", "ci", "cu")
 )
 EACH = ("max_correlation", "cross_covariance")
 """Options that have an element for each fusion."""
@@ -60,6 +60,13 @@ class Correlation:
         """Fuse rows `members` (B, N), of means (N, m, B) and covariances (N, m, m, B) of the components `some` (m,) of
         the space; what cannot be fused is NaN. And what each was fused by (B,): index into `lifecycle.WAYS`."""
         rule, options = self.config.rule, dict(self.config.rule_options)
+        doubted = _doubted(rows, members)
+        if doubted.any():
+            sure, ways = self._sure(rows, members, means, covariances, weights, some, ~doubted)
+            either = _part("cu", means, covariances, doubted)
+            columns = zip(_columns(either), _columns(sure), strict=True)
+            fused = Fused(*(np.where(doubted, a, b) for a, b in columns))
+            return fused, np.where(doubted, BY_UNION, ways).astype(np.uint8)
         if "scales" in options and len(some) < len(self.config.space):
             options["scales"] = np.asarray(options["scales"], dtype=np.float64)[some]
         if rule == AUTO or is_derived(rule, options):
@@ -68,6 +75,25 @@ class Correlation:
             options["max_correlation"] = self._between(rows, members)
         fused = fuse_last(rule, means, covariances, weights, influence=True, **options)
         return fused, np.zeros(len(members), dtype=np.uint8)
+
+    def _sure(
+        self,
+        rows: Rows,
+        members: Ints,
+        means: Floats,
+        covariances: Floats,
+        weights: Floats | None,
+        some: Ints,
+        mask: Bools,
+    ) -> tuple[Fused, Ways]:
+        """`fuse` of the elements of `mask` (B,), in a batch in which the others are NaN."""
+        whole, ways = _part("cu", means, covariances, np.zeros_like(mask)), np.zeros(len(mask), dtype=np.uint8)
+        if mask.any():
+            w = None if weights is None else weights[..., mask]
+            part, ways[mask] = self.fuse(rows, members[mask], means[..., mask], covariances[..., mask], w, some)
+            for column, wide in zip(_columns(part), _columns(whole), strict=True):
+                wide[..., mask] = column
+        return whole, ways
 
     def _between(self, rows: Rows, members: Ints) -> Floats:
         """Bounds (N, N, B) that are declared."""
@@ -107,6 +133,14 @@ class Correlation:
         fused = Fused(*(np.where(known, a, np.where(bounded, b, c)) for a, b, c in columns))
         way = np.where(known, BY_CROSS, np.where(bounded, np.where(derived, BY_DERIVED, BY_DECLARED), BY_CI))
         return fused, way.astype(np.uint8)
+
+
+def _doubted(rows: Rows, members: Ints) -> Bools:
+    """Which groups (B, N) of several rows hold one of a source that is fused by covariance union."""
+    union = getattr(rows, "union", None)
+    if union is None or members.shape[1] < 2:
+        return np.zeros(len(members), dtype=np.bool_)
+    return np.asarray(union[members].any(axis=1))
 
 
 def _part(rule: str, means: Floats, covariances: Floats, some: Bools, **options: Any) -> Fused:

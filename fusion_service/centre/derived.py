@@ -36,7 +36,7 @@ from fusion_service.centre.association import by_size
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.shared_noise import SharedNoise
 
-__all__ = ["MOST_MEMBERS", "Derived", "Followed", "Successive"]
+__all__ = ["MOST_MEMBERS", "Derived", "Followed", "Successive", "rows_of"]
 
 MOST_PAIRS = 200_000
 """Pairs that are followed at most."""
@@ -174,7 +174,7 @@ class Derived:
         old, count, n, K = self._pairs, len(rows.source), self.n, pair.shape[1]
         place = {name: i for i, name in enumerate(names)}
         number = np.array([*(place.get(name, -1) for name in self.names), -1], dtype=np.intp)
-        row = np.stack([_rows_of(rows, number[old.source[side]], old.epoch[side], old.id[side]) for side in (0, 1)])
+        row = np.stack([rows_of(rows, number[old.source[side]], old.epoch[side], old.id[side]) for side in (0, 1)])
         key = np.where((row >= 0).all(axis=0), row[0] * count + row[1], -1)
         order = np.argsort(key, kind="stable")
         asked = pair[0] * count + pair[1]
@@ -283,7 +283,7 @@ class Derived:
         )
 
 
-def _rows_of(rows: Rows, source: Ints, epoch: NDArray[np.uint64], ids: NDArray[np.uint64]) -> Ints:
+def rows_of(rows: Rows, source: Ints, epoch: NDArray[np.uint64], ids: NDArray[np.uint64]) -> Ints:
     """The rows (K,) of these tracks, -1 where there is none."""
     if not len(rows.source) or not len(ids):
         return np.full(len(ids), -1, dtype=np.intp)

@@ -51,7 +51,7 @@ def fuse_all(
     are not to be fused here.
     """
     tracks, config = rows.tracks, known.config
-    linked = (tracks.link != NO_TRACK) & ~tracks.outside
+    linked = rows.inside_mask()
     influence = np.where(tracks.link != NO_TRACK, 0.0, np.nan)
     linked = linked if left is None else linked & ~left
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked

@@ -78,7 +78,7 @@ class FusionCentre(Centre):
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         now = self._associate(rows, names, time)
-        self._supervisor.observe(rows, names, now, self._step, time, self._journal)
+        self._supervisor.observe(rows, names, now, self._step, time, self._journal, self._own())
         shared = self._blobs.follow(rows, names, now, time, self._intake.frame)
         rows = shared.widened()
         self._picture, influence = self._memory.fuse(rows, names, self._picture, now, self._step, time, self._journal)
@@ -87,6 +87,11 @@ class FusionCentre(Centre):
         self._supervisor.conduct.judge_existence(rows, self._picture, self._entries, time, self._journal)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
+
+    def _own(self) -> dict[str, tuple[float, float]]:
+        """What is known of the sources' own innovations, by name: mean normalised square, and freedom."""
+        records = self._memory.watch.records.items()
+        return {name: (one.ratio, one.freedom) for name, one in records if one.freedom > 0}
 
     def _watched(self) -> dict[str, dict[str, Any]]:
         watch, wanted = self._memory.watch, self.config.by_tracklets

@@ -71,7 +71,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     predicted, seen = _from_prediction(rows, linked, now, time, settings)
     jumped = fresh & (predicted > tests.keep[seen])
     outside = np.where(fresh, jumped, tracks.outside[linked])
-    some = np.flatnonzero(~outside)
+    some = np.flatnonzero(~outside if rows.out is None else ~outside & ~rows.out[linked])
     agreed = consensus(links[some], tracks.mean[:, linked[some]], tracks.covariance[:, :, linked[some]])
     distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)

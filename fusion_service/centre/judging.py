@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.centre.sources import Tracks
-from fusion_service.order import ABOUT, WHAT, LocalId, Order
+from fusion_service.order import ABOUT, STATES, WHAT, LocalId, Order
 from schemas import check_source
 
 __all__ = ["MOST_STANDING", "Outcome", "Seen", "Standing", "View", "find_local", "judge", "linked_to", "lives"]
@@ -51,7 +51,8 @@ class Standing:
 @dataclass(frozen=True, slots=True, eq=False)
 class View:
     """What an order is judged by: time, ns; ids (G,) u64 sorted of the global tracks; sources by name; the standing
-    orders; ignored: whom the config mutes. intensity: the centre links no local tracks."""
+    orders; ignored: whom the config mutes. intensity: the centre links no local tracks;
+    supervised: it judges its sources."""
 
     time: int
     ids: NDArray[np.uint64]
@@ -59,6 +60,7 @@ class View:
     standing: Mapping[int, Standing]
     ignored: frozenset[str] = frozenset()
     intensity: bool = False
+    supervised: bool = True
 
 
 class _No(Exception):
@@ -261,6 +263,20 @@ def _drop(order: Order, view: View) -> str:
     return f"forgets {len(view.sources[source].tracks.id)} tracks of {source}"
 
 
+def _supervise(order: Order, view: View) -> str:
+    _tracks_only(view)
+    source = _source(order, view)
+    if not view.supervised:
+        raise _No("this centre does not supervise its sources: set supervision under [centre]")
+    if order.state not in (*STATES, "auto"):
+        raise _No(f"there is no state {order.state!r}: known are {', '.join(STATES)}, auto")
+    if order.state == "auto":
+        if not _about(view, "supervise", source):
+            raise _No(f"{source} is judged by the centre already")
+        return f"judges {source} by its tracks again"
+    return f"takes {source} as {order.state}"
+
+
 def _withdraw(order: Order, view: View) -> str:
     one = view.standing.get(order.withdrawn)
     if one is None:
@@ -282,6 +298,7 @@ _CHECKS = {
     "quarantine": _quarantine,
     "release": _release,
     "drop": _drop,
+    "supervise": _supervise,
     "withdraw": _withdraw,
 }
 

@@ -25,7 +25,7 @@ from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 __all__ = ["WAYS", "Picture", "Support", "advance", "empty_picture", "newborn"]
 
-WAYS = ("", "tracklet", "bar-shalom-campo derived", "bci derived", "bci declared", "ci")
+WAYS = ("", "tracklet", "bar-shalom-campo derived", "bci derived", "bci declared", "ci", "cu")
 """What a track may be fused by: "" is the rule of the config."""
 
 

@@ -124,8 +124,9 @@ class Memory:
 
     def _capable(self, rows: Rows, names: tuple[str, ...]) -> Bools:
         """Rows (M,) whose versions may be taken as tracklets."""
-        sources = np.array([not self.watch.records[name].reason for name in names], dtype=np.bool_)
-        sources = sources[rows.source] & ~off_centre(rows, self._config.space)
+        doubted = (self._intake.treatment(name).union for name in names)
+        able = (not self.watch.records[name].reason and not union for name, union in zip(names, doubted, strict=True))
+        sources = np.array([*able], dtype=np.bool_)[rows.source] & ~off_centre(rows, self._config.space)
         return sources & sound_rows(rows) & ~self._unseen(rows, names) & kinship.alone(self._intake, rows)
 
     def _unseen(self, rows: Rows, names: tuple[str, ...]) -> Bools:
@@ -203,7 +204,8 @@ class Memory:
 
     def _inflation(self, name: str) -> float:
         said = self._intake.declared(self._intake.sources[name])
-        return said.inflation * self.watch.records[name].inflation
+        found = max(self.watch.records[name].inflation, *self._intake.treatment(name).inflation)
+        return said.inflation * found
 
     def _cut(self, rows: Rows, names: tuple[str, ...], at: Ints, count: int, time: int) -> NDArray[np.int64]:
         """Up to when (G,) all is in that the sources of each track will send."""

@@ -31,7 +31,15 @@ class Obeyed(NamedTuple):
 def view_of(intake: Intake, picture: Picture, time: int) -> View:
     """What orders are judged by at `time`, ns: live, not a copy."""
     ignored = frozenset(name for name, one in intake.config.sources.items() if one.ignore)
-    return View(time, picture.id, intake.sources, intake.orders.standing, ignored, intake.config.kind == "intensity")
+    return View(
+        time,
+        picture.id,
+        intake.sources,
+        intake.orders.standing,
+        ignored,
+        intake.config.kind == "intensity",
+        intake.config.supervision != "off",
+    )
 
 
 def obey(
@@ -203,6 +211,11 @@ class _Hands:
     def _drop(self, order: Order) -> None:
         source = self.intake.sources[order.source]
         source.tracks = source.tracks.take(slice(0, 0))
+
+    def _supervise(self, order: Order) -> None:
+        self._end_about("supervise", order.source)
+        if order.state != "auto":
+            self._stand(order)
 
     def _withdraw(self, order: Order) -> None:
         self.intake.orders.end([order.withdrawn])

@@ -25,7 +25,8 @@ class Rows:
     interval (M,): ns to the next report that is expected of it. lost (M,): the source's token is gone. gate (n + 1,
     M): d2 within which it may join or begin a track, by how many components are in common. fresh (M,): a measurement
     is in it that was not judged before. kept: how many of them each source has, in order. kin: whose data is in each,
-    None where that is not known. out (M,): of a source that is watched, but not fused.
+    None where that is not known. out (M,): of a source that is watched, but not fused; union (M,): of one that is fused
+    with others by covariance union.
     """
 
     source: NDArray[np.intp]
@@ -39,6 +40,7 @@ class Rows:
     kept: dict[str, int]
     kin: Kin | None = None
     out: NDArray[np.bool_] | None = None
+    union: NDArray[np.bool_] | None = None
 
     @property
     def echo(self) -> NDArray[np.bool_]:

@@ -17,6 +17,7 @@ EXAMPLE = """fusion-service order list
   fusion-service order rename --track 7 --name "PILOT 2" --number 12
   fusion-service order identify --track 7 --identity mmsi:257054000
   fusion-service order quarantine --source radar-3
+  fusion-service order supervise --source radar-3 --state trusted
   fusion-service order withdraw 4"""
 ANSWER = 5.0
 """Seconds that a centre has for its answer, and the hub to be there."""
@@ -39,7 +40,10 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--with", nargs=2, metavar=("SOURCE", "ID"), dest="against", help="never-link: another local track"
     )
-    parser.add_argument("--source", metavar="NAME", help="mute, unmute, quarantine, release, drop: the source")
+    parser.add_argument(
+        "--source", metavar="NAME", help="mute, unmute, quarantine, release, drop, supervise: the source"
+    )
+    parser.add_argument("--state", metavar="STATE", help="supervise: trusted, watch, inflated, union, out, or auto")
     parser.add_argument("--name", metavar="TEXT", help="rename: the callsign")
     parser.add_argument("--number", type=int, metavar="N", help="rename: the number to be shown")
     parser.add_argument("--identity", metavar="TEXT", help="identify: as in mmsi:257054000, icao:4ca7b4")
@@ -108,6 +112,7 @@ def _request(args: argparse.Namespace) -> dict[str, Any]:
         "name": args.name,
         "shown": args.number,
         "identity": args.identity,
+        "state": args.state,
         "number": args.withdrawn,
         "who": who,
         "why": args.why,
@@ -126,6 +131,7 @@ def _missing(request: dict[str, Any]) -> str:
         "local": "--local SOURCE ID",
         "source": "--source",
         "identity": "--identity",
+        "state": "--state",
         "number": "the order's number",
     }
     needed = NEEDED.get(request["what"], ())
@@ -140,7 +146,7 @@ def _table(orders: list[dict[str, Any]]) -> str:
     for one in orders:
         about = [f"track {one['track']}" if one.get("track") else "", one.get("source", "")]
         about += [f"{name} {track}" for name, _, track in [one[k] for k in ("local", "against") if k in one]]
-        about += [str(one[k]) for k in ("name", "shown", "identity") if k in one]
+        about += [str(one[k]) for k in ("name", "shown", "identity", "state") if k in one]
         about += ["holds " + ", ".join(f"{name} {track}" for name, _, track in one.get("holds", []))] * ("holds" in one)
         until = (
             datetime.fromtimestamp(one["until"] / 1e9, UTC).strftime("until %Y-%m-%dT%H:%M:%SZ")

@@ -280,6 +280,10 @@ class Conduct:
         """What an alarm that stands says of a source; "" where none does."""
         return next(iter(self._warnings.of(name, but=REFUSED)), "")
 
+    def stuck(self, name: str) -> str:
+        """What an alarm says of a source that is stuck as a whole; "" where none stands."""
+        return self._warnings.sentence((name, "stuck", ""))
+
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
         return {"alarms": self._warnings.of(name)}

@@ -13,7 +13,9 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 __all__ = ["MOST_PAIRS", "Shared", "shared_pairs"]
 
 MOST_PAIRS = 4000
-"""Pairs of one step that are looked at; of more, every so many."""
+"""Pairs of one step that are looked at; of more, those of every so many global tracks."""
+TURN = 32
+"""Steps for which the same ones are looked at: what a pair says in one step is compared with what it said before."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -29,8 +31,15 @@ class Shared:
 
 
 def shared_pairs(rows: Rows, step: int) -> Shared:
-    """The pairs of a step; of more than `MOST_PAIRS` those that it is the turn of in this `step`."""
+    """The pairs of a step; of more than about `MOST_PAIRS` those of the global tracks that it is the turn of in this
+    `step`."""
     linked = np.flatnonzero(rows.tracks.link != NO_TRACK)
+    size = np.unique(rows.tracks.link[linked], return_counts=True)[1]
+    every = 1
+    while every * MOST_PAIRS < int((size * (size - 1) // 2).sum()):
+        every *= 2
+    turn = (rows.tracks.link[linked] + np.uint64(step // TURN)) % np.uint64(every) == 0
+    linked = linked[turn]
     first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
     for _, members in by_size(rows.tracks.link[linked]):
         i, j = np.triu_indices(members.shape[1], 1)
@@ -39,8 +48,5 @@ def shared_pairs(rows: Rows, step: int) -> Shared:
     one, two = np.concatenate(first), np.concatenate(second)
     new = (rows.fresh[one] | rows.fresh[two]) & (rows.source[one] != rows.source[two])
     one, two = one[new], two[new]
-    order = np.lexsort((two, one))
-    every = -(-len(order) // MOST_PAIRS)
-    if every > 1:
-        order = order[step % every :: every]
+    order = np.lexsort((two, one))[: 2 * MOST_PAIRS]
     return Shared(one[order], two[order])

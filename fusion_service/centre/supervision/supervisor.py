@@ -5,16 +5,24 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from fusion_service.arrays import Floats
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.supervision.conduct import Conduct
+from fusion_service.centre.supervision.honesty import Honesty, Innovations, Opinion
 from fusion_service.centre.supervision.registration import Registration
 from fusion_service.centre.supervision.shared import shared_pairs
+from fusion_service.centre.supervision.states import States
 from fusion_service.centre.treatment import Treatment
 
 __all__ = ["Supervisor"]
+
+PACE = 30.0
+"""Steps over which the time between them is averaged."""
 
 
 class Supervisor:
@@ -22,36 +30,113 @@ class Supervisor:
 
     def __init__(self, intake: Intake) -> None:
         self._intake = intake
+        self._config = intake.config
         self.registration = Registration(intake)
         self.conduct = Conduct(intake)
+        self.states = States(self._config.supervision == "act")
+        self._honesty = Honesty(self._config.space)
+        self._opinions: dict[str, Opinion] = {}
+        self._last, self._pace = -1, 0.0
+        self._frame = intake.frame
 
-    def observe(self, rows: Rows, names: tuple[str, ...], now: Picture, step: int, time: int, journal: Journal) -> None:
+    def observe(
+        self,
+        rows: Rows,
+        names: tuple[str, ...],
+        now: Picture,
+        step: int,
+        time: int,
+        journal: Journal,
+        own: Innovations | None = None,
+    ) -> None:
         """Learn from a step, its links decided and nothing fused yet, and settle how sources are treated in the next.
-        now: the picture predicted to `time`, ns."""
+        now: the picture predicted to `time`, ns; own: what is known of the sources' own innovations."""
         self.conduct.observe(rows, names, time, journal)
         shared = shared_pairs(rows, step)
         self.registration.observe(rows, names, now, shared, time, journal)
+        if self._config.supervision != "off":
+            if self._frame != self._intake.frame:
+                self._honesty.rebase()
+                self._frame = self._intake.frame
+            self._honesty.observe(rows, names, shared, self._applied(names))
+            self._opinions = self._honesty.opinions(self._chance(time), own or {})
+            for event in self.states.settle(names, self._opinions, self._orders(), self._stuck(names), time):
+                journal.event(event)
         self._treat(names)
 
+    def _applied(self, names: tuple[str, ...]) -> Floats:
+        """By what (2, S) the covariances of the sources are multiplied in this step."""
+        factors = [self._intake.treatment(name).inflation for name in names]
+        return np.array(factors, dtype=np.float64).reshape(len(names), 2).T
+
+    def _chance(self, time: int) -> float:
+        """Of a false alarm about a source, at one look, of which there is one in every step."""
+        if 0 <= self._last < time:
+            seconds = (time - self._last) / 1e9
+            self._pace += (seconds - self._pace) / PACE if self._pace > 0 else seconds
+        self._last = time
+        return self._config.supervision_errors * (self._pace or self._config.period) / 3600.0
+
+    def _stuck(self, names: tuple[str, ...]) -> dict[str, str]:
+        """Whose tracks stand still to the bit, and the sentence that says so."""
+        return {name: said for name in names if (said := self.conduct.stuck(name))}
+
+    def _orders(self) -> dict[str, str]:
+        standing = self._intake.orders.standing.values()
+        return {one.order.source: one.order.state for one in standing if one.order.what == "supervise"}
+
     def _treat(self, names: tuple[str, ...]) -> None:
-        treatments = {name: Treatment(*self.registration.correction(name)) for name in names}
+        treatments = {name: self._treatment(name) for name in names}
         self._intake.treatments = {name: one for name, one in treatments.items() if one != Treatment()}
+
+    def _treatment(self, name: str) -> Treatment:
+        state = self.states.of(name)
+        factors = state.inflation if state.state in ("inflated", "out") else (1.0, 1.0)
+        out, union = state.state == "out", state.state == "union"
+        return Treatment(*self.registration.correction(name), inflation=factors, out=out, union=union)
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
-        return self.registration.health(name) | self.conduct.health(name)
+        told = self.registration.health(name) | self.conduct.health(name)
+        if self._config.supervision == "off":
+            return told
+        state, opinion = self.states.of(name), self._opinions.get(name)
+        said: dict[str, Any] = {"state": state.state, "state_why": state.why, "state_since": state.since}
+        if opinion is not None and np.isfinite(opinion.consistency):
+            said |= {
+                "consistency": opinion.consistency,
+                "consistency_low": opinion.low,
+                "consistency_high": opinion.high,
+                "inflation_position": max(opinion.factor[0], state.inflation[0]),
+                "inflation_velocity": max(opinion.factor[1], state.inflation[1]),
+            }
+        return said | told
 
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns."""
         self.registration.rebase(time)
         self.conduct.rebase(time)
+        self._honesty.rebase()
+        self.states.rebase(time)
+        self._last = min(self._last, time)
 
     def packed(self) -> dict[str, Any]:
         """As plain values."""
-        return {"registration": self.registration.packed(), "conduct": self.conduct.packed()}
+        packed = {"registration": self.registration.packed(), "conduct": self.conduct.packed()}
+        if self._config.supervision == "off":
+            return packed
+        pace = [self._last, self._pace, repr(self._intake.frame)]
+        return packed | {"honesty": self._honesty.packed(), "states": self.states.packed(), "pace": pace}
 
     def restore(self, packed: Mapping[str, Any]) -> None:
         """From what `packed` gave."""
         self.registration.restore(packed.get("registration", {}))
         self.conduct.restore(packed.get("conduct", {}))
+        if "honesty" in packed and self._config.supervision != "off":
+            self._honesty.restore(packed["honesty"])
+            self.states.restore(packed["states"])
+            self._last, self._pace, frame = packed["pace"]
+            self._frame = self._intake.frame
+            if frame != repr(self._frame):
+                self._honesty.rebase()
         self._treat(self._intake.names())

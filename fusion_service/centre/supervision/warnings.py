@@ -65,6 +65,11 @@ class Warnings:
         ]
         return [sentence for _, _, sentence in sorted(mine)[:SHOWN]]
 
+    def sentence(self, key: Key) -> str:
+        """What one of them says; "" where it does not stand."""
+        one = self._standing.get(key)
+        return "" if one is None else one.sentence
+
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns: nothing was seen later."""
         self._standing = {
