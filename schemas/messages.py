@@ -156,7 +156,8 @@ class SensorInfo(Header):
     position (x, y, z) in `frame`, m, and its covariance (3, 3); period, initiation_delay in seconds;
     detection_probability in [0, 1] inside `coverage`; may_start: its tracks may start global tracks;
     correlation_group: sources of one group share errors (one navigation system, say); feedback: its tracker is fed
-    with fused tracks, so that its tracks hold what others have measured.
+    with fused tracks, so that its tracks hold what others have measured; polar: it measures ranges and bearings, so
+    that its ranges may be off.
     """
 
     type: ClassVar[str] = "sensor_info"
@@ -171,6 +172,7 @@ class SensorInfo(Header):
     position_covariance: Floats | None = None
     correlation_group: str | None = None
     feedback: bool | None = None
+    polar: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

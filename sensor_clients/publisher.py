@@ -166,6 +166,7 @@ class TrackPublisher(_MessagePublisher):
         position_covariance: ArrayLike | None = None,
         correlation_group: str | None = None,
         feedback: bool | None = None,
+        polar: bool | None = None,
     ) -> SensorInfo:
         """Say what this source is (fields: `schemas.SensorInfo`; m, s). Who joins later gets it as well; say it
         again whenever it changes."""
@@ -181,6 +182,7 @@ class TrackPublisher(_MessagePublisher):
             "position_covariance": _maybe(_floats, "position_covariance", position_covariance, (3, 3)),
             "correlation_group": correlation_group,
             "feedback": feedback,
+            "polar": polar,
         }
         return self._send(SensorInfo, local_key(self.source, "info", self.realm), 1, parts)
 

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats
 from fusion_service.centre import kinship
 from fusion_service.centre.evidence import chi2_by_size
 from fusion_service.centre.intake import MAX_TOTAL, Intake
@@ -17,7 +16,7 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
+from fusion_service.centre.sources import LINKS, Columns, Source, Tracks, join_tracks, no_parts
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.centre.treatment import treated
 from fusion_service.densities import Mixtures
@@ -54,7 +53,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
             table, said.motion, source.space, config.space, age, intake.frame, config.unknown_speed
         )
         if config.kind == "tracks":
-            predicted = _shifted(treated(predicted, config.space, treatment), shift_of(intake, source))
+            predicted = _shifted(treated(predicted, config.space, treatment), intake, source)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
@@ -90,8 +89,10 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     )
 
 
-def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:
-    """Tracks that may all be off by one shift of this covariance (n, n), besides their own errors."""
+def _shifted(tracks: Tracks, intake: Intake, source: Source) -> Tracks:
+    """Tracks that may all be off by the shift that their source states, besides their own errors; where its error is
+    known better, and corrected, as they are."""
+    shift = None if intake.treatment(source.name).correction is not None else shift_of(intake, source)
     if shift is None:
         return tracks
     more = shift[:, :, None]
