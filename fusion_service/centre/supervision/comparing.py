@@ -49,10 +49,12 @@ class Compared:
 
 def labels(rows: Rows, same: Mapping[int, int]) -> NDArray[np.uint64]:
     """The target of each row (M,): the global track it is linked to, or that which this is the `same` as; 0: none."""
-    label = rows.tracks.link.copy()
-    for one, other in sorted(same.items()):
-        label[label == np.uint64(one)] = np.uint64(other)
-    return label
+    if not same:
+        return rows.tracks.link
+    old = np.array(sorted(same), dtype=np.uint64)
+    new = np.array([same[one] for one in old.tolist()], dtype=np.uint64)
+    at = np.minimum(np.searchsorted(old, rows.tracks.link), len(old) - 1)
+    return np.where(old[at] == rows.tracks.link, new[at], rows.tracks.link)
 
 
 def chosen_rows(rows: Rows, label: NDArray[np.uint64], now: Picture, whose: Ints, lasting: Lasting, step: int) -> Ints:

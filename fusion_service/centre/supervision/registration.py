@@ -29,6 +29,7 @@ from fusion_service.centre.supervision.estimate import Information, Posterior
 from fusion_service.centre.supervision.gauge import connected, gauge, gauge_words
 from fusion_service.centre.supervision.lasting import Lasting, robust
 from fusion_service.centre.supervision.shared import Shared
+from fusion_service.centre.supervision.unlinked import Unlinked
 from fusion_service.centre.treatment import Correction
 from schemas import Ecef
 
@@ -66,7 +67,7 @@ class Registration:
         self._epochs: dict[str, int] = {}
         self._applied: dict[str, Applied] = {}
         self._known: _Known | None = None
-        self._same: dict[int, int] = {}
+        self._unlinked = Unlinked()
         self._step, self._time = 0, -1
 
     @property
@@ -93,7 +94,7 @@ class Registration:
         if not self._information.names:
             self._known = None
             return
-        label = labels(rows, self._same)
+        label = labels(rows, self._unlinked.same())
         row = chosen_rows(rows, label, now, whose, self._lasting, self._step)
         how = self._how()
         part = compared(rows, row, label, now, whose, how, self._intake.config.space)
@@ -101,6 +102,8 @@ class Registration:
         if self._known is None or not len(row):
             self._estimate(how.site)
         self._weigh(part)
+        assert self._known is not None
+        self._unlinked.look(rows, whose, how.site, self._known.sigma, self._intake.config.space, self._step)
         self._decide(journal)
 
     def _arrange(self, rows: Rows, names: tuple[str, ...]) -> Ints:
@@ -274,7 +277,7 @@ class Registration:
             "effect": to_bytes(self._effect),
             "epochs": dict(self._epochs),
             "applied": {name: one.packed() for name, one in sorted(self._applied.items())},
-            "same": [[one, other] for one, other in sorted(self._same.items())],
+            "unlinked": self._unlinked.packed(),
             "step": self._step,
             "time": self._time,
         }
@@ -291,7 +294,7 @@ class Registration:
         self._effect = from_bytes(packed["effect"], like).reshape(-1, 2)
         self._epochs = {str(name): int(epoch) for name, epoch in packed["epochs"].items()}
         self._applied = {str(name): Applied.unpacked(one) for name, one in packed["applied"].items()}
-        self._same = {int(one): int(other) for one, other in packed["same"]}
+        self._unlinked.restore(packed["unlinked"])
         self._step, self._time = int(packed["step"]), int(packed["time"])
         if self._works and self._information.names and set(self._information.names) <= set(self._intake.sources):
             self._estimate(self._how().site)
