@@ -39,6 +39,7 @@ P = len(PARAMETERS)
 MOST_SOURCES = 64
 """That are estimated together: those that share most."""
 SEEN = 6
+CERTAIN = 0.25
 
 
 @dataclass(slots=True, eq=False)
@@ -185,11 +186,13 @@ class Registration:
         return np.asarray(group.z - sum(group.H[:, k] * mean[group.source, k] for k in range(P)))
 
     def _certain(self, part: Compared) -> Bools:
-        """Of which rows (M,) the errors are so well known that what stays of them does not look like an error that
-        lasts."""
+        """The rows (M,) of targets of which all errors are so well known that what stays of them hardly looks like an
+        error that lasts: what a fit leaves is short of them as much as they are uncertain."""
         assert self._known is not None
         common = _common(part, self._known.posterior)
-        return np.asarray(common[0, 0] + common[1, 1] < 0.05 * (part.own[0, 0] + part.own[1, 1]))
+        vague = common[0, 0] + common[1, 1] > CERTAIN * (part.own[0, 0] + part.own[1, 1])
+        group = part.group
+        return np.asarray(np.bincount(group.group, vague, minlength=len(group.start))[group.group] == 0)
 
     def _estimate(self, sites: Floats) -> None:
         names, info = self._information.names, self._information
