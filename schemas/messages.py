@@ -169,7 +169,7 @@ class SensorInfo(Header):
     detection_probability in [0, 1] inside `coverage`; may_start: its tracks may start global tracks;
     correlation_group: sources of one group share errors (one navigation system, say); feedback: its tracker is fed
     with fused tracks, so that its tracks hold what others have measured; heading_sigma: rad, of an error that turns all
-    its tracks about its position alike.
+    its tracks about its position alike; polar: it measures ranges and bearings, so that its ranges may be off.
     """
 
     type: ClassVar[str] = "sensor_info"
@@ -185,6 +185,7 @@ class SensorInfo(Header):
     heading_sigma: float | None = None
     correlation_group: str | None = None
     feedback: bool | None = None
+    polar: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

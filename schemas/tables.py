@@ -135,6 +135,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("may_start", values.boolean),
         _plain("correlation_group", values.text, optional=True),
         _plain("feedback", values.boolean, optional=True),
+        _plain("polar", values.boolean, optional=True),
     ),
     GlobalTracks: (
         *_HEADER,

@@ -175,6 +175,7 @@ class TrackPublisher(_MessagePublisher):
         heading_sigma: float | None = None,
         correlation_group: str | None = None,
         feedback: bool | None = None,
+        polar: bool | None = None,
     ) -> SensorInfo:
         """Say what this source is (fields: `schemas.SensorInfo`; m, s). Who joins later gets it as well; say it
         again whenever it changes."""
@@ -191,6 +192,7 @@ class TrackPublisher(_MessagePublisher):
             "heading_sigma": heading_sigma,
             "correlation_group": correlation_group,
             "feedback": feedback,
+            "polar": polar,
         }
         return self._send(SensorInfo, local_key(self.source, "info", self.realm), 1, parts)
 

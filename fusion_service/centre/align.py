@@ -99,8 +99,10 @@ def _brought(intake: Intake, source: Source, table: Tracks, time: int) -> Tracks
     tracks = predict_tracks(table, motion, source.space, config.space, age, intake.frame, config.unknown_speed)
     if config.kind != "tracks":
         return tracks
-    tracks = _shifted(treated(tracks, config.space, treatment), shift_of(intake, source))
-    return with_reference(turned(tracks, source, config.space, intake.frame), config.space, intake.frame)
+    tracks = treated(tracks, config.space, treatment)
+    if treatment.correction is None:  # else what remains of these errors is in it already
+        tracks = turned(_shifted(tracks, shift_of(intake, source)), source, config.space, intake.frame)
+    return with_reference(tracks, config.space, intake.frame)
 
 
 def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:

@@ -67,7 +67,7 @@ class Memory:
         for event in self.watch.begin(self._intake, names):
             if self._config.by_tracklets:
                 journal.event(event)
-        versions = versions_of(self._intake, rows)
+        versions = versions_of(self._intake, rows, time)
         found = increments(versions)
         at = np.where(rows.inside_mask(), now.find(rows.tracks.link), -1)
         capable = self._capable(rows, names)
@@ -209,7 +209,9 @@ class Memory:
 
     def _cut(self, rows: Rows, names: tuple[str, ...], at: Ints, count: int, time: int) -> NDArray[np.int64]:
         """Up to when (G,) all is in that the sources of each track will send."""
-        lag = np.array([self._intake.sources[name].lag for name in names], dtype=np.int64)
+        intake = self._intake
+        lags = [max(intake.sources[name].lag + intake.treatment(name).clock, 0) for name in names]
+        lag = np.array(lags, dtype=np.int64)
         late = np.zeros(count, dtype=np.int64)
         fed = at >= 0
         np.maximum.at(late, at[fed], lag[rows.source[fed]])

@@ -17,11 +17,19 @@ PLACES = ("x", "y", "z")
 
 
 class Correction(Protocol):
-    """A registration error that is taken off a source's tracks."""
+    """A registration error that is taken off a source's tracks. loose: what remains uncertain of it is too much to be
+    neglected beside their own errors."""
+
+    @property
+    def loose(self) -> bool: ...
 
     def off(self, tracks: Tracks) -> Tracks:
         """The tracks, in the picture's space and frame, without it; what remains uncertain of it added to their
         covariances."""
+        ...
+
+    def moved(self, mean: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+        """Densities (n, T), (n, n, T) without it, and nothing added."""
         ...
 
 

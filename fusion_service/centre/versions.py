@@ -8,7 +8,7 @@ nothing else. A version in which there is no newer measurement, or that comes af
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from fusion_service.centre.align import predict_tracks
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import Pair, Tracks, join_tracks
+from fusion_service.centre.treatment import Treatment
 from schemas import Motion
 
 __all__ = ["Versions", "versions_of"]
@@ -32,7 +33,7 @@ class Versions:
     """K new versions of rows, in order of (time, row). row (K,): index into the step's `Rows`; time, before (K,) ns of
     the new and of the old one; predicted_mean (n, K) and predicted_covariance (n, n, K): the old one predicted to
     `time`; mean, covariance: the new one; both in the centre's space and frame, as the source said them (neither
-    inflated nor with its registration error)."""
+    inflated nor with its registration error added), but for what is corrected of that."""
 
     row: Ints
     time: NDArray[np.int64]
@@ -47,10 +48,11 @@ class Versions:
         return Versions(*(getattr(self, one.name)[..., at] for one in fields(self)))
 
 
-def versions_of(intake: Intake, rows: Rows) -> Versions:
-    """All versions that came in with this step, of rows that are used in it."""
+def versions_of(intake: Intake, rows: Rows, time: int) -> Versions:
+    """All versions that came in with the step at `time`, ns, of rows that are used in it; none is later, whatever the
+    clock of its source was thought to be when it came."""
     n = len(intake.config.space)
-    parts = [part for name, part in _by_source(intake, rows) if len(part.row)]
+    parts = [part for name, part in _by_source(intake, rows, time) if len(part.row)]
     if not parts:
         none, whole = np.zeros((n, 0)), np.zeros(0, dtype=np.int64)
         return Versions(np.zeros(0, dtype=np.intp), whole, whole, none, np.zeros((n, n, 0)), none, np.zeros((n, n, 0)))
@@ -60,14 +62,28 @@ def versions_of(intake: Intake, rows: Rows) -> Versions:
     return joined.take(np.lexsort((joined.row, joined.time)))
 
 
-def _by_source(intake: Intake, rows: Rows) -> Iterator[tuple[str, Versions]]:
+def _by_source(intake: Intake, rows: Rows, time: int) -> Iterator[tuple[str, Versions]]:
     start = 0
     for name, count in rows.kept.items():
         source, ids = intake.sources[name], rows.tracks.id[start : start + count]
         if source.pairs and count:
             said = intake.declared(source)
-            yield name, _versions(source.pairs, said.motion, said.inflation, source.space, intake, ids, start)
+            part = _versions(source.pairs, said.motion, said.inflation, source.space, intake, ids, start)
+            yield name, _registered(part, intake.treatment(name), time)
         start += count
+
+
+def _registered(versions: Versions, treatment: Treatment, latest: int) -> Versions:
+    """Versions of one source at their true times, its registration error taken off as it is now of both the old and the
+    new ones; what remains uncertain of it is not added, since it is no error of a measurement (see `watch`)."""
+    if treatment.clock:
+        when, before = (np.minimum(at - treatment.clock, latest) for at in (versions.time, versions.before))
+        versions = replace(versions, time=when, before=before)
+    if treatment.correction is None:
+        return versions
+    old = treatment.correction.moved(versions.predicted_mean, versions.predicted_covariance)
+    new = treatment.correction.moved(versions.mean, versions.covariance)
+    return Versions(versions.row, versions.time, versions.before, *old, *new)
 
 
 def _versions(

@@ -182,7 +182,9 @@ def reason_of(intake: Intake, source: Source) -> str:
         return "feedback"
     if said.covariance_floor > 0.0:
         return "covariance_floor"
-    if shift_of(intake, source) is not None or heading_sigma_of(source):
+    correction = intake.treatment(source.name).correction
+    stated = shift_of(intake, source) is not None or bool(heading_sigma_of(source))
+    if stated if correction is None else correction.loose:
         return "registration"
     if not set(source.space) <= set(intake.config.space) or _goes_unseen(source, intake.config.space, said.motion):
         return "space"

@@ -103,8 +103,8 @@ def test_many_versions_of_a_track_in_a_step_are_taken_as_fewer() -> None:
 def test_what_is_thinned_is_a_chain_still(monkeypatch: pytest.MonkeyPatch) -> None:
     seen = []
 
-    def spied(intake: object, rows: object) -> object:
-        seen.append(versions_of(intake, rows))  # type: ignore[arg-type]
+    def spied(intake: object, rows: object, time: int) -> object:
+        seen.append(versions_of(intake, rows, time))  # type: ignore[arg-type]
         return seen[-1]
 
     monkeypatch.setattr("fusion_service.centre.memory.versions_of", spied)

@@ -1,0 +1,82 @@
+"""By what errors are measured where no source is declared to be right.
+
+What sources say of shared targets tells their errors against each other: nothing is changed where all clocks are off by
+the same time, or the whole picture is shifted, turned or stretched. Sources that are connected by shared targets and
+have no reference among them are measured by their weighted mean, which is kept at nothing: a weight is the smaller the
+more certain a source claims less and the farther it is from the median,
+
+    w = (1 / sigma^2) s^2 / (s^2 + (theta - median)^2),
+
+so that of three or more the odd one out is the one that is found wrong. Of two nobody can tell: each gets its half of
+the difference. An offset of all ranges is no such freedom, and is not kept.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.centre.supervision.bias import PARAMETERS, RANGE
+
+__all__ = ["SHARED", "connected", "gauge", "gauge_words"]
+
+SHARED = 0.5
+"""Shared targets, faded, from which two sources are connected."""
+FLOOR = 0.03
+"""Of sigma: no two sources are thought to agree better than that."""
+KEPT = tuple(at for at in range(len(PARAMETERS)) if at != RANGE)
+
+
+def connected(shared: Floats) -> Ints:
+    """Which sources (S,) hang together by shared targets: the number of the first of them."""
+    label = np.arange(len(shared))
+    linked = shared >= SHARED
+    for _ in range(len(shared)):
+        least = np.where(linked, label[None], len(label)).min(axis=1, initial=len(label))
+        new = np.minimum(label, least)
+        new = new[new]
+        if (new == label).all():
+            break
+        label = new
+    return label
+
+
+def gauge(
+    sigma: Floats, label: Ints, reference: Bools, mean: Floats | None = None, variance: Floats | None = None
+) -> Floats:
+    """Sums (K, S, 6), in units of sigma (S, 6), that are kept at 0; mean, variance (S, 6): the estimate in any other
+    gauge, by which those that agree are found; left out: all weigh by their sigma alone."""
+    rows = []
+    for first in np.unique(label).tolist():
+        mine = np.flatnonzero(label == first)
+        if len(mine) < 2 or reference[mine].any():
+            continue
+        for parameter in KEPT:
+            some = mine[sigma[mine, parameter] > 0]
+            if len(some) < 2:
+                continue
+            weight = 1.0 / sigma[some, parameter] ** 2
+            if mean is not None and variance is not None:
+                off = mean[some, parameter] - np.median(mean[some, parameter])
+                spread = variance[some, parameter] + (FLOOR * sigma[some, parameter]) ** 2
+                weight = weight * spread / (spread + off**2)
+            row = np.zeros(sigma.shape)
+            row[some, parameter] = weight * sigma[some, parameter]
+            rows.append(row / np.sqrt((row**2).sum()))
+    return np.stack(rows) if rows else np.zeros((0, *sigma.shape))
+
+
+def gauge_words(names: tuple[str, ...], at: int, label: Ints, reference: Bools) -> str:
+    """By what the errors of the source `at` are measured."""
+    mine = np.flatnonzero(label == label[at])
+    if reference[at]:
+        return "it is the reference: by its clock and place others are measured"
+    sure = [names[k] for k in mine.tolist() if reference[k]]
+    if sure:
+        return "relative to " + ", ".join(sure[:3]) + (" and others" if len(sure) > 3 else "")
+    if len(mine) == 2:
+        other = names[int(mine[mine != at][0])]
+        return f"half of the difference to {other}: which of the two is wrong cannot be told; a reference would tell"
+    if len(mine) > 2:
+        return f"relative to the weighted mean of {len(mine)} sources, in which those that agree weigh most"
+    return "no other source shares targets with it"
