@@ -240,10 +240,9 @@ class TrackPublisher(_MessagePublisher):
             "kind": None if kind is None else tuple(kind),
             "kind_p": _maybe(_floats, "kind_p", kind_p, (None,)),
             "track_lineage": None if lineages is None else _bits(lineages, self._lineage or ()),
-            **_threes(extent=extent, extent_sigma=extent_sigma),
-            "shape": shape,
-            "reference": reference,
-            "reference_covariances": _maybe(_floats, "reference_covariances", reference_covariances, (None, 2, 2)),
+            "extent": _maybe(_floats, "extent", extent, (None, 3)),
+            "extent_sigma": _maybe(_floats, "extent_sigma", extent_sigma, (None, 3)),
+            **_reference(shape, reference, reference_covariances),
         }
         return self._send(LocalTracks, local_key(self.source, "tracks", self.realm), 8, parts)
 
@@ -310,9 +309,10 @@ def _maybe(convert: Callable[..., Any], name: str, value: Any, *options: Any) ->
     return None if value is None else convert(name, value, *options)
 
 
-def _threes(**columns: ArrayLike | None) -> dict[str, Any]:
-    """Columns of three numbers a row."""
-    return {name: _maybe(_floats, name, column, (None, 3)) for name, column in columns.items()}
+def _reference(shape: str | None, reference: str | None, covariances: ArrayLike | None) -> dict[str, Any]:
+    """What an extent is of, and where a mean lies in it."""
+    known = _maybe(_floats, "reference_covariances", covariances, (None, 2, 2))
+    return {"shape": shape, "reference": reference, "reference_covariances": known}
 
 
 def _all_sound(sound: Callable[[NDArray[np.float64]], NDArray[np.bool_]], column: NDArray[np.float64] | None) -> bool:

@@ -51,8 +51,8 @@ def test_a_turn_and_a_shift_of_all_change_nothing() -> None:
     rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     for box in (True, False):
         one = to_hulls(points, outlines(place, extent, box), covariances)
-        other = to_hulls(points @ rotation.T + shift, outlines(place @ rotation.T + shift, extent + np.array([0, 0, turn]), box),
-                         rotation @ covariances @ rotation.T)  # fmt: skip
+        turned = outlines(place @ rotation.T + shift, extent + np.array([0, 0, turn]), box)
+        other = to_hulls(points @ rotation.T + shift, turned, rotation @ covariances @ rotation.T)
         np.testing.assert_allclose(one, other, atol=1e-9)
         half = to_hulls(points, outlines(place, extent + np.array([0, 0, np.pi]), box), covariances)
         np.testing.assert_allclose(one, half, atol=1e-9)
