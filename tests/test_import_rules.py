@@ -15,7 +15,7 @@ PACKAGES = ("schemas", "fusion_service", "sensor_clients")
 GROUND_FLOOR = {
     f"fusion_service.{name}"
     for name in (
-        *("linalg", "geodesy", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
+        *("linalg", "geodesy", "hulls", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
         *("errors", "arrays", "order", "turn", "ways", "source_words"),
     )
 }

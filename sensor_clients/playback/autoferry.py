@@ -22,6 +22,8 @@ from fusion_service.errors import DataError
 from schemas import Disk, Enu, Height
 from sensor_clients.events import Event, Parameter, Scenario
 from sensor_clients.filters.measurement import Floats
+from sensor_clients.playback.autoferry_hulls import PARAMETERS as HULL_PARAMETERS
+from sensor_clients.playback.autoferry_hulls import hulls
 from sensor_clients.playback.cameras import EO, IR, CameraSensor, CameraTracker
 from sensor_clients.playback.harbour import LIDAR, RADAR, HarbourSensor, HarbourTracker
 
@@ -50,6 +52,7 @@ MOVED = 1.0
 
 PARAMETERS: tuple[Parameter, ...] = (
     Parameter("frame", "ENU about Piren, 63.4389029083 N 10.39908278 E 39.923 m", "data set's README"),
+    *HULL_PARAMETERS,
     *(row for sensor in SENSORS.values() for row in sensor.parameters()),
 )
 
@@ -150,7 +153,10 @@ def truth_events(truth: dict[int, tuple[Floats, Floats]], start: int, end: int) 
             if times[0] <= t <= times[-1]
         }
         fields = {"space": ("x", "y"), "frame": PIREN, "ids": np.array(list(places), dtype=np.uint64)}
-        yield Event(time, "truth", fields | {"means": np.array(list(places.values())).reshape(-1, 2)})
+        fields |= {"means": np.array(list(places.values())).reshape(-1, 2)}
+        if places:
+            fields |= {"extent": np.concatenate([hulls(k, *truth[k], np.array([t])) for k in places]), "shape": "box"}
+        yield Event(time, "truth", fields)
 
 
 def load(directory: Path, number: int) -> Scenario:

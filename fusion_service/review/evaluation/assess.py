@@ -264,10 +264,9 @@ class _Score:
         self._reference, self._truth, self._infos = reference, truth, book.infos
         self._exists = np.isfinite(truth.states[:, :, 0])
         count, targets = self._exists.shape
-        self._tallies = {
-            key: Tally(truth.times, truth.states, len(reference.axes), reference.c) for key in reference.motions
-        }
-        self._alone = None if reference.centres else Tally(truth.times, truth.states, len(reference.axes), reference.c)
+        what = truth.times, truth.states, len(reference.axes), reference.c, truth.hulls
+        self._tallies = {key: Tally(*what) for key in reference.motions}
+        self._alone = None if reference.centres else Tally(*what)
         self._seen = np.zeros((count, targets), dtype=np.int16)
         self._begins = np.full(targets, -1)
         self._confirmed = {name: np.full(targets, -1) for name in reference.centres}

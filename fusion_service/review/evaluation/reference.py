@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_service.arrays import Floats
 from fusion_service.errors import ReviewError
+from fusion_service.review.evaluation.hulls import TrueHulls, true_hulls
 from fusion_service.review.evaluation.logbook import Logbook
 from fusion_service.review.snapshots import STALE_PERIODS, STALE_STEPS, Times, truth_path, truth_positions
 from schemas import Frame, Motion, Truth
@@ -38,11 +39,12 @@ class Reference(NamedTuple):
 
 
 class ScoredTruth(NamedTuple):
-    """times (K,), ids of T targets, their states (K, T, m)."""
+    """times (K,), ids of T targets, their states (K, T, m), and their hulls, None where truth tells none."""
 
     times: Times
     targets: tuple[int, ...]
     states: Floats
+    hulls: TrueHulls | None = None
 
 
 def reference_for(
@@ -120,7 +122,7 @@ def scored_truth(
         )
     states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
     states[~np.isfinite(states[:, :, : len(reference.axes)]).all(axis=2)] = np.nan
-    return ScoredTruth(times, tuple(paths), states)
+    return ScoredTruth(times, tuple(paths), states, true_hulls(truths, reference.frame, times, tuple(paths)))
 
 
 def all_times(book: Logbook, pictures: Times | None, every: float | None) -> Times:

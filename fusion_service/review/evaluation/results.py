@@ -8,6 +8,7 @@ from typing import Any
 
 from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.evaluation.assess import Assessment
+from fusion_service.review.evaluation.hull_table import hull_lines
 from fusion_service.review.evaluation.scoring import plain
 from fusion_service.review.evaluation.tables import (
     NUMBERS,
@@ -96,6 +97,7 @@ def text(assessments: Sequence[Assessment]) -> str:
                 lines.append(f"of {centre} (--centre NAME shows another, --html and --json all of them):")
             scored = {**evaluation.sources, **({"fused": evaluation.fused} if evaluation.centre else {})}
             lines += [format_table(evaluation), ""]
+            lines += [*hull, ""] if (hull := hull_lines(scored)) else []
             lines += [*aligned(tracking_table(scored, len(evaluation.targets))), confirm_line(evaluation)]
         lines += ["", *truthless_lines(one, centre)]
     return "\n".join(line for k, line in enumerate(lines) if line or k == 0 or lines[k - 1])

@@ -18,6 +18,7 @@ from scipy.special import gammaincinv
 from fusion_service.arrays import Floats
 from fusion_service.metrics import DENSE, assign_near, near_pairs, nees, nees_bounds
 from fusion_service.review.evaluation.continuity import Following, Instant, Siap, ospa2, siap_of
+from fusion_service.review.evaluation.hulls import HullScore, HullTally, TrueHulls
 from fusion_service.review.snapshots import Block, Times
 
 __all__ = ["METRICS", "WINDOW", "Scores", "Series", "Tally", "averages", "bounds", "plain"]
@@ -78,7 +79,7 @@ class Scores:
     mean NEES of position over its dimension (1 is ideal), are NaN without a pair. bounds: 95 % for the anees of
     so many pairs. errors (K, T), m, and nees (K, T), over the dimension: NaN where no track was assigned.
     rmse_velocity, m/s: NaN without velocities. ospa, ospa2: means, m. followed: targets that had a track assigned at
-    half of their times or more. tracks: how many were ever shown.
+    half of their times or more. tracks: how many were ever shown. hull: None where truth tells no extents.
     """
 
     gospa: float
@@ -98,6 +99,7 @@ class Scores:
     tracks: int
     siap: Siap
     series: Series
+    hull: HullScore | None = None
 
     def as_json(self) -> dict[str, float | int | None]:
         """The seven numbers of `METRICS`, None for what does not exist."""
@@ -110,6 +112,7 @@ class Scores:
             **{name: plain(getattr(self, name)) for name in names},
             "siap": {name: plain(getattr(self.siap, name)) for name in Siap.__slots__},
             "series": self.series.as_json(),
+            **({"hull": self.hull.as_json()} if self.hull is not None else {}),
         }
 
 
@@ -119,7 +122,7 @@ class Tally:
     times (K,); truth (K, T, m): position, and then velocity, NaN where it is not known or a target does not exist.
     """
 
-    def __init__(self, times: Times, truth: Floats, d: int, c: float) -> None:
+    def __init__(self, times: Times, truth: Floats, d: int, c: float, hulls: TrueHulls | None = None) -> None:
         count, targets = truth.shape[:2]
         self._times, self._truth, self._d, self._c = times, truth, d, c
         self._parts = np.zeros((count, 3))
@@ -137,6 +140,7 @@ class Tally:
         self._tracks = np.zeros(0, dtype=np.bool_)
         """By the number of a track: whether it was ever shown."""
         self._following = Following(targets)
+        self._hulls = None if hulls is None else HullTally(hulls)
         self._window: deque[Instant] = deque(maxlen=WINDOW)
         self._stride = max(1, count // WINDOWS)
         self._windows: list[tuple[int, float]] = []
@@ -194,6 +198,9 @@ class Tally:
         self._errors[k, targets] = apart
         offset = block.states[rows] - self._truth[k, targets]
         self._nees[k, targets] = nees(offset[:, :d], block.covariances[rows]) / d
+        if self._hulls is not None:
+            true, shown_ = self._truth[k, targets][:, :2], block.states[rows][:, :2]
+            self._hulls.add(k, targets, true, shown_, block.covariances[rows][:, :2, :2])
         velocity = (offset[:, d:] ** 2).sum(axis=1)
         known = np.isfinite(velocity) & (offset.shape[1] > d)
         self._velocity += velocity[known].sum(), known.sum()
@@ -233,6 +240,7 @@ class Tally:
             tracks=int(self._tracks.sum()),
             siap=self._siap_of(exists),
             series=series,
+            hull=None if self._hulls is None else self._hulls.score(),
         )
 
     def _series(self, pairs: NDArray[np.bool_], exists: NDArray[np.bool_]) -> Series:

@@ -16,6 +16,7 @@ import schemas
 from fusion_service.process import data_folder
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback import autoferry
+from sensor_clients.playback.autoferry_hulls import hulls
 from sensor_clients.playback.following import ClutterMap
 from sensor_clients.playback.harbour import LIDAR, RADAR, HarbourSensor, HarbourTracker, cluster
 
@@ -185,3 +186,18 @@ def test_real_scenes_score_better_than_no_tracks_at_all(number: int) -> None:
             if event.kind == "tracks"
         ]
         assert np.mean(scores) < 18.0
+
+
+def test_a_hull_lies_along_the_course_and_keeps_it_while_the_vessel_lies_still() -> None:
+    """North-east at 2 m/s for 30 s, then still."""
+    times = np.arange(0.0, 60.0, 0.5)
+    places = np.minimum(times, 30.0)[:, None] * np.sqrt(2.0)
+    found = hulls(2, times, np.tile(places, (1, 2)), np.array([-5.0, 10.0, 55.0]))
+    np.testing.assert_allclose(found, [[36.25, 9.6, np.pi / 4]] * 3)
+    jet = hulls(2, times + 1_620_200_000.0, np.tile(places, (1, 2)), times[:1] + 1_620_200_000.0)
+    assert jet[0, 0] < 10.0
+    still = hulls(1, times, np.zeros((len(times), 2)), times[:2])
+    assert np.isnan(still[:, 2]).all()
+    assert np.isfinite(still[:, :2]).all()
+    assert np.isnan(hulls(7, times, np.zeros((len(times), 2)), times[:2])).all()
+    assert hulls(1, times, np.zeros((len(times), 2)), times[:0]).shape == (0, 3)
