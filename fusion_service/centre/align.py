@@ -17,7 +17,7 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import LINKS, Columns, Tracks, join_tracks, no_parts
+from fusion_service.centre.sources import LINKS, Columns, Source, Tracks, join_tracks, no_parts
 from fusion_service.centre.standing import turned
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.centre.treatment import treated
@@ -55,8 +55,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
             table, said.motion, source.space, config.space, age, intake.frame, config.unknown_speed
         )
         if config.kind == "tracks":
-            predicted = _shifted(treated(predicted, config.space, treatment), shift_of(intake, source))
-            predicted = turned(predicted, source, config.space, intake.frame)
+            predicted = _uncertain(treated(predicted, config.space, treatment), intake, source)
         sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
         count = int(sound.sum())
         if count < len(sound):
@@ -90,6 +89,11 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         kin=kin,
         out=_joined(out, np.bool_),
     )
+
+
+def _uncertain(tracks: Tracks, intake: Intake, source: Source) -> Tracks:
+    """Tracks of a source, with what it states of its own place and heading."""
+    return turned(_shifted(tracks, shift_of(intake, source)), source, intake.config.space, intake.frame)
 
 
 def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:

@@ -116,7 +116,7 @@ def test_a_source_that_jumps_as_a_whole() -> None:
     results = flown(jumping(21, 25, slice(None)), 26)
     assert told(results) == [("jump", "a")]
     (begun, event), *_ = alarms(results)
-    assert (begun, event["tracks"], event["of_tracks"]) == (21, 3, 3)
+    assert (begun, event["count"], event["among"]) == (21, 3, 3)
     assert event["metres"] == pytest.approx(3000.0, abs=60.0)
 
 

@@ -151,10 +151,10 @@ class Conduct:
         claims = (repeats >= FEW) & (travelled > 3.0 * found.sigma)
         if claims.any():
             worst = int(np.flatnonzero(claims)[travelled[claims].argmax()])
-            numbers = {"tracks": int(claims.sum()), "of_tracks": len(at), "id": int(tracks.id[at[worst]]),
+            numbers = {"count": int(claims.sum()), "among": len(at), "id": int(tracks.id[at[worst]]),
                        "seconds": float(seconds[worst]), "speed": float(found.speed[worst])}  # fmt: skip
             sentence = (
-                f"{numbers['tracks']} of its {len(at)} tracks repeat to the bit (track {numbers['id']} for "
+                f"{numbers['count']} of its {len(at)} tracks repeat to the bit (track {numbers['id']} for "
                 f"{seconds[worst]:.0f} s at {found.speed[worst]:.1f} m/s): is the feed frozen?"
             )
             self._warnings.raised((source.name, "stuck", ""), time, numbers, sentence, journal)
@@ -162,7 +162,7 @@ class Conduct:
         counted = at[tracks.identity[at] == NONE]
         frozen = (new["varied"][counted] >= VARIED) & (new["since"][counted] == new["since"][counted[:1]])
         if len(counted) > 1 and frozen.all() and (repeats >= FEW).all():
-            numbers = {"tracks": len(at), "of_tracks": len(at), "seconds": float(seconds.max())}
+            numbers = {"count": len(at), "among": len(at), "seconds": float(seconds.max())}
             sentence = (
                 f"all its {len(at)} tracks repeat to the bit for {seconds.max():.0f} s, and varied before: "
                 f"is the feed frozen?"
@@ -176,7 +176,7 @@ class Conduct:
         count, whole = len(some), len(found.at)
         away = float(np.sort(found.away[some])[count // 2])
         if count > 1 and count >= TOGETHER * whole:
-            numbers: dict[str, Any] = {"tracks": count, "of_tracks": whole, "metres": away}
+            numbers: dict[str, Any] = {"count": count, "among": whole, "metres": away}
             sentence = f"{count} of its {whole} tracks jumped at once, by {away:.0f} m: its place, clock or numbers?"
             self._warnings.raised((source.name, "jump", ""), time, numbers, sentence, journal)
             return
