@@ -29,7 +29,7 @@ ELSEWHERE = {
 SECTIONS = {
     "Use it": [
         *("tutorial", "operating", "judgement", "tracklets", "extent", "motion", "rules", "mixtures", "partial"),
-        *("review", "docker", "wire"),
+        *("review", "conduct", "platforms", "docker", "wire"),
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "rules-speed"],
     "API": ["api/*"],

@@ -20,6 +20,7 @@ from schemas import (
     Message,
     MessageError,
     Motion,
+    Platform,
     SensorInfo,
     Truth,
     decode,
@@ -72,6 +73,7 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
             coverage=Disk(1e4),
             detection_probability=0.9,
             position_covariance=np.eye(3),
+            heading_sigma=0.02,
         )
         radar.tracks(
             **scan(
@@ -86,6 +88,7 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
                 kind_p=[0, 1],
                 height=Height(5.0, 2.0),
                 lineages=[["b"], ["a", "b"]],
+                platform=Platform((1.0, 2.0, 3.0), heading=0.5),
             )
         )
         radar.intensity(time=5, space=["x", "y"], frame=SITE, weights=[1.5], means=[[1, 2]], covariances=[np.eye(2)])
@@ -105,6 +108,9 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
     assert (info.position, info.period, info.coverage) == ((1.0, 2.0, 3.0), 2.0, Disk(1e4))
     full, empty = by_key[prefix + "tracks"]
     assert isinstance(full, LocalTracks)
+    assert full.platform is not None
+    assert (full.platform.position, full.platform.heading) == ((1.0, 2.0, 3.0), 0.5)
+    assert info.heading_sigma == 0.02
     assert full.track_lineage is not None
     assert full.track_lineage.tolist() == [[0b10], [0b11]]
     assert isinstance(full, LocalTracks)

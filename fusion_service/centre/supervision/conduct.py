@@ -4,7 +4,8 @@
                     speed that would have taken them further than three sigma; or all tracks of a source do, two at
                     least, from one moment on, each of which was new every time before. One alone may be of an object
                     that stops, seen by a sensor that rounds; a ship at anchor says what it is, and is not counted
-    jump            the tracks of a source jump together, or a track that says what it is jumps, or one again and again
+    jump            the tracks of a source jump together, or a track that says what it is jumps, or one again and again.
+                    Of those that do not say what they are only such as were there for a while: numbers are used again
     unseen          a track that only this source has, though two others at least cover the place and have missed it
                     beyond doubt (their scans without it: 10^-6 and less)
     identity-twice  the source has one identity in two places
@@ -114,7 +115,9 @@ class Conduct:
         tracks, old = source.tracks, record.columns
         new = {name: np.zeros(len(tracks.id), kind) for name, kind in COLUMNS.items()}
         new["id"] = tracks.id
-        if len(old["id"]):
+        if np.array_equal(old["id"], tracks.id):
+            new = {name: column.copy() for name, column in old.items()}
+        elif len(old["id"]):
             place = np.minimum(np.searchsorted(old["id"], tracks.id), len(old["id"]) - 1)
             known = old["id"][place] == tracks.id
             for name in COLUMNS:
@@ -123,19 +126,21 @@ class Conduct:
         before = self._before[source.name].tracks
         first = before.time[np.searchsorted(before.id, tracks.id[at])]
         new["since"][at] = np.where(found.again & (new["repeats"][at] > 0), new["since"][at], first)
-        ended = new["repeats"][at] > 0
+        ended, varied = new["repeats"][at] > 0, new["varied"][at]
         new["repeats"][at] = np.where(found.again, new["repeats"][at] + 1, 0)
-        new["varied"][at] = np.where(found.again, new["varied"][at], np.where(ended, 1, new["varied"][at] + 1))
+        new["varied"][at] = np.where(found.again, varied, np.where(ended, 1, varied + 1))
         recent = time - new["last"] <= HOLD * 1e9
         new["jumps"][~recent] = 0
-        jumped = at[found.jumped]
-        new["jumps"][jumped] += 1
-        new["last"][jumped] = time
+        settled = (varied >= VARIED) | (new["jumps"][at] > 0) | (tracks.identity[at] != NONE)
+        jumped = found.jumped & settled
+        new["varied"][at[found.jumped]] = 0
+        new["jumps"][at[jumped]] += 1
+        new["last"][at[jumped]] = time
         record.columns = new
-        if len(at):
+        if (new["repeats"][at] >= FEW).any():
             self._stuck(source, new, found, time, journal)
-        if len(jumped):
-            self._jumped(source, new, found, time, journal)
+        if jumped.any():
+            self._jumped(source, new, found._replace(jumped=jumped), time, journal)
 
     def _stuck(
         self, source: Source, new: dict[str, NDArray[Any]], found: Moves, time: int, journal: Journal
@@ -146,10 +151,10 @@ class Conduct:
         claims = (repeats >= FEW) & (travelled > 3.0 * found.sigma)
         if claims.any():
             worst = int(np.flatnonzero(claims)[travelled[claims].argmax()])
-            numbers = {"tracks": int(claims.sum()), "of_tracks": len(at), "id": int(tracks.id[at[worst]]),
+            numbers = {"count": int(claims.sum()), "among": len(at), "id": int(tracks.id[at[worst]]),
                        "seconds": float(seconds[worst]), "speed": float(found.speed[worst])}  # fmt: skip
             sentence = (
-                f"{numbers['tracks']} of its {len(at)} tracks repeat to the bit (track {numbers['id']} for "
+                f"{numbers['count']} of its {len(at)} tracks repeat to the bit (track {numbers['id']} for "
                 f"{seconds[worst]:.0f} s at {found.speed[worst]:.1f} m/s): is the feed frozen?"
             )
             self._warnings.raised((source.name, "stuck", ""), time, numbers, sentence, journal)
@@ -157,7 +162,7 @@ class Conduct:
         counted = at[tracks.identity[at] == NONE]
         frozen = (new["varied"][counted] >= VARIED) & (new["since"][counted] == new["since"][counted[:1]])
         if len(counted) > 1 and frozen.all() and (repeats >= FEW).all():
-            numbers = {"tracks": len(at), "of_tracks": len(at), "seconds": float(seconds.max())}
+            numbers = {"count": len(at), "among": len(at), "seconds": float(seconds.max())}
             sentence = (
                 f"all its {len(at)} tracks repeat to the bit for {seconds.max():.0f} s, and varied before: "
                 f"is the feed frozen?"
@@ -171,7 +176,7 @@ class Conduct:
         count, whole = len(some), len(found.at)
         away = float(np.sort(found.away[some])[count // 2])
         if count > 1 and count >= TOGETHER * whole:
-            numbers: dict[str, Any] = {"tracks": count, "of_tracks": whole, "metres": away}
+            numbers: dict[str, Any] = {"count": count, "among": whole, "metres": away}
             sentence = f"{count} of its {whole} tracks jumped at once, by {away:.0f} m: its place, clock or numbers?"
             self._warnings.raised((source.name, "jump", ""), time, numbers, sentence, journal)
             return

@@ -69,35 +69,45 @@ def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, conf
     nothing = Moves(whole, none > 0, none, none, none > 0, none)
     if (old.epoch, old.space, old.frame) != (source.epoch, source.space, frame) or not len(old.tracks.id):
         return nothing
-    place = np.minimum(np.searchsorted(old.tracks.id, new.id), len(old.tracks.id) - 1)
     before = old.tracks
-    later = (before.id[place] == new.id) & (new.time > before.time[place]) & (new.updated > before.updated[place])
-    later &= before.origin[place] == new.origin
-    at = np.flatnonzero(later)
-    if not len(at):
+    at, was = _later(before, new)
+    count = len(at)
+    if not count:
         return nothing
-    was, now = place[at], at
-    x, y = before.mean[:, was], new.mean[:, now]
-    P, R = before.covariance[:, :, was], new.covariance[:, :, now]
-    again = (x == y).all(axis=0) & (P == R).all(axis=(0, 1))
-    dt = (new.time[now] - before.time[was]) / 1e9
-    known = Unknown.of(source.space).known(P)
-    away, spread, speed, sigma, moved = (np.zeros(len(at)) for _ in range(5))
+    if count == len(before.id) == len(new.id):
+        x, y, P, R = before.mean, new.mean, before.covariance, new.covariance
+    else:
+        x, y, P, R = before.mean[:, was], new.mean[:, at], before.covariance[:, :, was], new.covariance[:, :, at]
+    again = np.asarray((x == y).all(axis=0))
+    if again.any():
+        again[again] = (P[:, :, again] == R[:, :, again]).all(axis=(0, 1))
+    dt = (new.time[at] - before.time[was]) / 1e9
+    limit = Unknown.of(source.space).limit
+    away, spread, speed, sigma = np.zeros((4, count))
     for axis, rate in AXES:
         if axis not in source.space:
             continue
         k = source.space.index(axis)
-        v, dv = np.zeros(len(at)), np.full(len(at), (TIMES * config.unknown_speed / SIGMAS) ** 2)
+        off, wide = y[k] - x[k], np.full(count, (TIMES * config.unknown_speed / SIGMAS) ** 2)
         if rate in source.space:
             i = source.space.index(rate)
-            v, dv = np.where(known[i], x[i], 0.0), np.where(known[i], P[i, i], dv)
-        counts = known[k]
-        away += np.where(counts, (y[k] - x[k] - v * dt) ** 2, 0.0)
-        spread += np.where(counts, P[k, k] + R[k, k] + dv * dt**2 + 2.0 * shift**2, 0.0)
+            known = P[i, i] < limit[i]
+            v, wide = np.where(known, x[i], 0.0), np.where(known, P[i, i], wide)
+            off = off - v * dt
+            speed += v * v
+        counts = P[k, k] < limit[k]
+        away += np.where(counts, off * off, 0.0)
+        spread += np.where(counts, P[k, k] + R[k, k] + wide * dt * dt + 2.0 * shift * shift, 0.0)
         sigma += np.where(counts, R[k, k], 0.0)
-        speed += v**2
     moved = np.sqrt(away)
-    far = SIGMAS * np.sqrt(spread) + TIMES * config.manoeuvre * dt**2 / 2
+    far = SIGMAS * np.sqrt(spread) + TIMES * config.manoeuvre * dt * dt / 2
     held = dt <= PAUSE * np.maximum(before.interval[was], 1) / 1e9
-    jumped = held & (moved > far) & np.isfinite(far)
-    return Moves(at, again, np.sqrt(speed), np.sqrt(sigma), jumped, moved)
+    return Moves(at, again, np.sqrt(speed), np.sqrt(sigma), held & (moved > far) & np.isfinite(far), moved)
+
+
+def _later(before: Tracks, new: Tracks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """The new versions (K,) in a table, with a newer measurement, and what they follow in the table before."""
+    place = np.minimum(np.searchsorted(before.id, new.id), len(before.id) - 1)
+    later = (before.id[place] == new.id) & (new.time > before.time[place]) & (new.updated > before.updated[place])
+    at = np.flatnonzero(later & (before.origin[place] == new.origin))
+    return at, place[at]

@@ -168,6 +168,12 @@ class Story:
                 self.say(at, f"the order to {event.get('what')} stands no more: {event.get('why')}")
             elif kind in ("alarm", "alarm_over") and self.track in _listed(event.get("tracks")):
                 self.say(at, f"{event.get('identity')} is {'' if kind == 'alarm' else 'no longer '}in two places")
+            elif (
+                kind in ("alarm", "copy")
+                and event.get("why")
+                and (event.get("track") == self.track or source in sources)
+            ):
+                self.say(at, f"{source}: {event['why']}")
 
     def _concerned(self, event: dict[str, Any], sources: set[str]) -> str:
         """Whom of this story an order is about; empty where nobody of it."""
