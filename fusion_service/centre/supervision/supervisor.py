@@ -16,6 +16,7 @@ from fusion_service.centre.supervision.honesty import Honesty, Innovations, Opin
 from fusion_service.centre.supervision.registration import Registration
 from fusion_service.centre.supervision.shared import shared_pairs
 from fusion_service.centre.supervision.states import States
+from fusion_service.centre.supervision.traffic import Traffic
 from fusion_service.centre.treatment import Treatment
 
 __all__ = ["Supervisor"]
@@ -32,6 +33,7 @@ class Supervisor:
         self._config = intake.config
         self.registration = Registration(intake)
         self.states = States(self._config.supervision == "act")
+        self.traffic = Traffic()
         self._honesty = Honesty(self._config.space)
         self._opinions: dict[str, Opinion] = {}
         self._last, self._pace = -1, 0.0
@@ -52,6 +54,7 @@ class Supervisor:
         shared = shared_pairs(rows, step)
         self.registration.observe(rows, names, now, shared, time, journal)
         if self._config.supervision != "off":
+            self.traffic.observe(rows, names, now, self._intake, time)
             if self._frame != self._intake.frame:
                 self._honesty.rebase()
                 self._frame = self._intake.frame
@@ -102,13 +105,14 @@ class Supervisor:
                 "inflation_position": max(opinion.factor[0], state.inflation[0]),
                 "inflation_velocity": max(opinion.factor[1], state.inflation[1]),
             }
-        return said | self.registration.health(name)
+        return said | self.traffic.health(name, self._intake.sources[name]) | self.registration.health(name)
 
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns."""
         self.registration.rebase(time)
         self._honesty.rebase()
         self.states.rebase(time)
+        self.traffic.rebase(time)
         self._last = min(self._last, time)
 
     def packed(self) -> dict[str, Any]:
@@ -117,7 +121,12 @@ class Supervisor:
         if self._config.supervision == "off":
             return packed
         pace = [self._last, self._pace, repr(self._intake.frame)]
-        return packed | {"honesty": self._honesty.packed(), "states": self.states.packed(), "pace": pace}
+        return packed | {
+            "honesty": self._honesty.packed(),
+            "states": self.states.packed(),
+            "pace": pace,
+            "traffic": self.traffic.packed(),
+        }
 
     def restore(self, packed: Mapping[str, Any]) -> None:
         """From what `packed` gave."""
@@ -125,6 +134,7 @@ class Supervisor:
         if "honesty" in packed and self._config.supervision != "off":
             self._honesty.restore(packed["honesty"])
             self.states.restore(packed["states"])
+            self.traffic.restore(packed["traffic"])
             self._last, self._pace, frame = packed["pace"]
             self._frame = self._intake.frame
             if frame != repr(self._frame):
