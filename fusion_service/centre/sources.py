@@ -279,9 +279,10 @@ class Source:
 
     interval: between its scans, ns, measured (-1: not yet). remembered: its tracks that went stale. vote: the frame it
     speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason.
-    lag: how far behind the last step its messages come, ns, about the longest of late. places: of its
-    newest messages that say one. Of the step being made: arrived, the ids that came; pairs, their versions, where those
-    are followed; ahead, the time of the newest message that is for a later one.
+    lag: how far behind the last step its messages come, ns, about the longest of late. places: of its newest messages
+    that say one. Of the step being made: came, the time of each message with tracks, and when it came, ns; arrived, the
+    ids that came; pairs, their versions, where those are followed; ahead, the time of the newest message that is for a
+    later one.
     """
 
     name: str
@@ -306,6 +307,7 @@ class Source:
     vote: Vote | None = None
     why: str = ""
     unused: dict[str, int] = field(default_factory=dict)
+    came: list[tuple[int, int]] = field(default_factory=list)
     arrived: list[NDArray[np.uint64]] = field(default_factory=list)
     ahead: int = -1
     lag: int = 0
@@ -359,6 +361,7 @@ class Source:
     def heard(self, received: int, time: int, last: int) -> None:
         """Tracks of `time` came at `received`, after the step at `last` (-1: none), ns."""
         late = max(last - time, 0) if last >= 0 else 0
+        self.came.append((time, received))
         self.offset, self.lag = received - time, max(late, self.lag - (self.lag - late) // 8)
 
     def apply(

@@ -8,7 +8,8 @@ weights only place the mean; uniform unless given.
 
 Two sources have a closed form. With U_1 = T T', U_2 = T diag(r) T' the least det is that of
 T diag(max(r, 1)) T'; the least trace is that of U_1 + (U_2 - U_1)_+, the positive part. For more, the
-problem is convex (det: in P^-1) and a barrier method finds P to a duality gap of `GAP`, from within.
+problem is convex (det: in P^-1) and a barrier method finds P to a duality gap of `GAP`, from within; where rounding
+does not let it, in longdouble either, P is what joining them two by two gives: above all, if not the smallest.
 
 Promise (max): conservative if one source is, that is, if for one i the truth given all estimates has mean
 x_i and covariance at most P_i. Li-AA's Lemmas 1 and 2 need just this; a covariance P_i that holds on average
@@ -50,11 +51,11 @@ def cu(sources: Sources, weights: Floats | None, influence: bool, *, criterion: 
         size = linalg.logdet(U) if criterion == "det" else trace(U)
         P = np.take_along_axis(U, size.argmin(axis=0)[None, None, None], axis=2)[:, :, 0]
     else:
-        P, spread = U[:, :, 0], np.ones_like(worst)
+        P, worst = U[:, :, 0], np.zeros_like(worst)
         for i in range(1, sources.count):
             P, more = _join(criterion, P, U[:, :, i])
-            spread = np.maximum(spread, more)
-        worst = 10.0 * worst * spread
+            worst = np.maximum(worst, 10.0 * more)
+        worst = np.where(margin.min(axis=0) > 0.0, worst, np.inf)
         if sources.count > 2:
             P, gap = _smallest(criterion, P, U)
     return Result(sources.means[:, 0] + x, P, w, w if influence else None, worst, gap)
@@ -72,13 +73,19 @@ RULE = Rule(
 
 
 def _join(criterion: str, U: Floats, W: Floats) -> tuple[Floats, Floats]:
-    """The smallest matrix above both, and what rounding grows by."""
+    """The smallest matrix above both, and what rounding grows by.
+
+    The result is above both, so it is the condition of the larger that counts: how flat the smaller one is does not.
+    """
+    swap = linalg.logdet(W) > linalg.logdet(U)
+    U, W = np.where(swap, W, U), np.where(swap, U, W)
+    base = condition(U, linalg.inverse(U))
     if criterion == "det":
-        T, _, r, grown = pencil(U, W)
-        return spectral(T, np.maximum(r, 1.0)), grown
+        T, _, r, _ = pencil(U, W)
+        return spectral(T, np.maximum(r, 1.0)), base * np.maximum(np.abs(r).max(axis=0), 1.0)
     size, Q = eigen(W - U)
     P = U + spectral(Q, np.maximum(size, 0.0))
-    return P, np.abs(size).max(axis=0) / np.stack([P[k, k] for k in range(len(P))]).min(axis=0)
+    return P, base * np.abs(size).max(axis=0) / np.stack([P[k, k] for k in range(len(P))]).min(axis=0)
 
 
 def _smallest(criterion: str, start: Floats, U: Floats) -> tuple[Floats, Floats]:
@@ -88,21 +95,24 @@ def _smallest(criterion: str, start: Floats, U: Floats) -> tuple[Floats, Floats]
     F = L * np.sqrt(d)
     identity = np.zeros_like(start)
     identity[range(n), range(n)] = 1.0
-    V = linalg.congruence(lower_inverse(F)[:, :, None] + np.zeros_like(U), U)  # at most I
+    K, pivots = linalg.ldl(U)
+    G = linalg.product(lower_inverse(F)[:, :, None] + np.zeros_like(U), K * np.sqrt(pivots))  # G G' is at most I
     if criterion == "det":
-        ends, sign, X, C = linalg.inverse(V), -1.0, 0.5 * identity, None
+        ends, X, C = G, 0.5 * identity, None
     else:
-        ends, sign, X = V, 1.0, 2.0 * identity
+        ends, X = linalg.product(G, G.swapaxes(0, 1)), 2.0 * identity
         C = linalg.product(F.swapaxes(0, 1), F)
         C /= trace(C)
     best, gap = np.array(X), np.full_like(start[0, 0], np.inf)
-    todo, t = np.arange(size), np.ones_like(gap)
+    todo, t, stopped = np.arange(size), np.ones_like(gap), np.ones(size, dtype=np.bool_)
+    last = U.dtype != np.float64
     for _ in range(ROUNDS):
-        X, done, stuck = _newton(X, ends, C, t, sign)
+        X, done, stuck = _newton(X, ends, C, t)
         final = t >= N * n / GAP
         finished = (done & final) | stuck
         best[..., todo[finished]] = X[..., finished]
         gap[todo[finished]] = np.where(stuck, np.inf, N * n / t)[finished]
+        stopped[todo[finished]] = stuck[finished]
         t = np.where(done & ~final, t * FACTOR, t)
         keep = ~finished
         if not keep.any():
@@ -112,17 +122,30 @@ def _smallest(criterion: str, start: Floats, U: Floats) -> tuple[Floats, Floats]
     P = linalg.congruence(F, linalg.inverse(best) if criterion == "det" else best)
     size_of = linalg.logdet if criterion == "det" else trace
     new, old = size_of(P), size_of(start)
-    no_worse = old <= new + 2.0 * GAP * (np.abs(new) if criterion == "trace" else 1.0)
+    no_worse = ~(old > new + 2.0 * GAP * (np.abs(new) if criterion == "trace" else 1.0))
+    no_worse |= stopped & last  # longdouble does not find it either: what is above all, if not the smallest
     return np.where(no_worse, start, P), np.where(no_worse, 0.0, gap)
 
 
-def _newton(X: Floats, ends: Floats, C: Floats | None, t: Floats, sign: float) -> tuple[Floats, Bools, Bools]:
-    """One damped Newton step of t c(X) - sum log det sign (X - ends_i); whether it was a small one, or none.
+def _slack(X: Floats, ends: Floats, C: Floats | None) -> Floats:
+    """S_i(X) (n, n, N, B) of `_newton`."""
+    if C is not None:
+        return X[:, :, None] - ends
+    inside = linalg.product(linalg.product(ends.swapaxes(0, 1), X[:, :, None]), ends)
+    return np.eye(len(X), dtype=X.dtype)[:, :, None, None] - 0.5 * (inside + inside.swapaxes(0, 1))
 
-    c is trace C X, or -log det X where C is None.
+
+def _newton(X: Floats, ends: Floats, C: Floats | None, t: Floats) -> tuple[Floats, Bools, Bools]:
+    """One damped Newton step of t c(X) - sum log det S_i(X); whether it was a small one, or none.
+
+    c is trace C X and S_i = X - ends_i, or, where C is None, c is -log det X and S_i = I - G_i' X G_i, G_i = ends_i:
+    X <= (G_i G_i')^-1 without the inverse, whose large elements would cost the digits of the small ones.
     """
-    V = linalg.inverse(sign * (X[:, :, None] - ends))
-    slope = -sign * total(np.moveaxis(V, 2, 0))
+    slack = _slack(X, ends, C)
+    V = linalg.inverse(slack)
+    if C is None:
+        V = linalg.product(linalg.product(ends, V), ends.swapaxes(0, 1))
+    slope = total(np.moveaxis(V, 2, 0)) * (1.0 if C is None else -1.0)
     curved = [(V, np.ones_like(t))]
     if C is None:
         Y = linalg.inverse(X)
@@ -148,8 +171,8 @@ def _newton(X: Floats, ends: Floats, C: Floats | None, t: Floats, sign: float) -
         D[a, b] = D[b, a] = value
 
     def height(X: Floats) -> Floats:
-        slack = total(linalg.logdet(sign * (X[:, :, None] - ends)))
-        out: Floats = (t * inner(C, X) if C is not None else -t * linalg.logdet(X)) - slack
+        room = total(linalg.logdet(_slack(X, ends, C)))
+        out: Floats = (t * inner(C, X) if C is not None else -t * linalg.logdet(X)) - room
         return out
 
     here, length = height(X), np.ones_like(t)

@@ -32,8 +32,10 @@ __all__ = ["BLOCKS", "Honesty", "Innovations", "Opinion"]
 
 BLOCKS = ("positions", "velocities")
 REMEMBERED = 600.0
-"""Differences of a pair of sources that its sums hold about, or those of `SCANS` scans where these are more."""
+"""Independent differences of a pair of sources that its sums hold about, or those of `SCANS` scans where it is more."""
 SCANS = 30.0
+LONGER = 10.0
+"""How many times more at most, of differences that are correlated in time."""
 MOST_SOURCE_PAIRS = 4096
 MOST_NAMES = 2000
 FEW = 3.0
@@ -125,7 +127,8 @@ class Honesty:
         good = np.isfinite(square) & np.isfinite(share)
         pair, u, share, last, square = pair[good], u[:, good], share[good], last[:, good], square[good]
         count = np.bincount(pair, minlength=K).astype(np.float64)
-        most = np.maximum(REMEMBERED, SCANS * count)
+        rho = _correlation(sums.moved[:, block], sums.square[:, block], sums.moves[:, block], k, 0.0)
+        most = np.maximum(REMEMBERED * np.minimum((1.0 + rho**2) / (1.0 - rho**2), LONGER), SCANS * count)
         weight = sums.weight[:, block]
         kept = np.where(count > 0, np.minimum(1.0, most / np.maximum(weight + count, 1.0)), 1.0)
         below, part = binned(square)
@@ -253,8 +256,7 @@ class Honesty:
         sums = self._sums
         some = np.flatnonzero(sums.weight[:, block] > 0.0)
         weight, moves = sums.weight[some, block], sums.moves[some, block]
-        rho = sums.moved[some, block] / np.maximum(sums.square[some, block], 1e-300)
-        rho = np.clip(np.maximum(rho, 0.0) + 2.0 / np.sqrt(k * moves + 1.0), 0.0, 0.99)
+        rho = _correlation(sums.moved[some, block], sums.square[some, block], moves, k, 2.0)
         count = np.maximum(
             weight * (1.0 - rho**2) / (1.0 + rho**2), weight / np.maximum(sums.updates[some, block], 1.0)
         )
@@ -289,6 +291,12 @@ class Honesty:
         self._names = [str(name) for name in packed["names"]]
         self._factors = from_bytes(packed["factors"], self._factors).reshape(2, len(self._names))
         self._beside.restore(packed["beside"])
+
+
+def _correlation(moved: Floats, square: Floats, moves: Floats, k: int, sigmas: float) -> Floats:
+    """From one difference of a pair of tracks to the next, (K,): as measured, and so many of its sigmas more."""
+    rho = np.maximum(moved / np.maximum(square, 1e-300), 0.0)
+    return np.asarray(np.clip(rho + sigmas / np.sqrt(k * moves + 1.0), 0.0, 0.99))
 
 
 def _whitened(P: Floats, Q: Floats, r: Floats) -> tuple[Floats, Floats]:

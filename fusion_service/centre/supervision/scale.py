@@ -38,12 +38,18 @@ def _expected(k: int) -> float:
     return float(chi2.cdf(CUT * k, k + 2) + CUT * chi2.sf(CUT * k, k))
 
 
+@cache
+def _median(k: int) -> float:
+    """The median of chi2_k / k."""
+    return float(chi2.median(k) / k)
+
+
 def robust_scale(histogram: Floats, k: int) -> Floats:
     """The scale (K,) of squares over k degrees of freedom each, from histograms (K, BINS); 1 where there are none."""
     total = np.add.reduce(histogram, axis=1)
     safe = np.where(total > 0.0, total, 1.0)
     middle = (np.cumsum(histogram, axis=1) >= 0.5 * safe[:, None]).argmax(axis=1)
-    scale = CENTRES[middle] / (chi2.median(k) / k)
+    scale = CENTRES[middle] / _median(k)
     for _ in range(ROUNDS):
         cut = np.minimum(CENTRES, CUT * scale[:, None])
         scale = np.add.reduce(histogram * cut, axis=1) / (safe * _expected(k))

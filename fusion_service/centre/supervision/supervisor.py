@@ -17,6 +17,7 @@ from fusion_service.centre.supervision.honesty import Honesty, Innovations, Opin
 from fusion_service.centre.supervision.registration import Registration
 from fusion_service.centre.supervision.shared import shared_pairs
 from fusion_service.centre.supervision.states import States
+from fusion_service.centre.supervision.traffic import Traffic
 from fusion_service.centre.treatment import Treatment
 
 __all__ = ["Supervisor"]
@@ -34,6 +35,7 @@ class Supervisor:
         self.registration = Registration(intake)
         self.conduct = Conduct(intake)
         self.states = States(self._config.supervision == "act")
+        self.traffic = Traffic()
         self._honesty = Honesty(self._config.space)
         self._opinions: dict[str, Opinion] = {}
         self._last, self._pace = -1, 0.0
@@ -55,6 +57,7 @@ class Supervisor:
         shared = shared_pairs(rows, step)
         self.registration.observe(rows, names, now, shared, time, journal)
         if self._config.supervision != "off":
+            self.traffic.observe(rows, names, now, self._intake, time)
             if self._frame != self._intake.frame:
                 self._honesty.rebase()
                 self._frame = self._intake.frame
@@ -110,7 +113,7 @@ class Supervisor:
                 "inflation_position": max(opinion.factor[0], state.inflation[0]),
                 "inflation_velocity": max(opinion.factor[1], state.inflation[1]),
             }
-        return said | told
+        return said | self.traffic.health(name, self._intake.sources[name]) | told
 
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns."""
@@ -118,6 +121,7 @@ class Supervisor:
         self.conduct.rebase(time)
         self._honesty.rebase()
         self.states.rebase(time)
+        self.traffic.rebase(time)
         self._last = min(self._last, time)
 
     def packed(self) -> dict[str, Any]:
@@ -126,7 +130,12 @@ class Supervisor:
         if self._config.supervision == "off":
             return packed
         pace = [self._last, self._pace, repr(self._intake.frame)]
-        return packed | {"honesty": self._honesty.packed(), "states": self.states.packed(), "pace": pace}
+        return packed | {
+            "honesty": self._honesty.packed(),
+            "states": self.states.packed(),
+            "pace": pace,
+            "traffic": self.traffic.packed(),
+        }
 
     def restore(self, packed: Mapping[str, Any]) -> None:
         """From what `packed` gave."""
@@ -135,6 +144,7 @@ class Supervisor:
         if "honesty" in packed and self._config.supervision != "off":
             self._honesty.restore(packed["honesty"])
             self.states.restore(packed["states"])
+            self.traffic.restore(packed["traffic"])
             self._last, self._pace, frame = packed["pace"]
             self._frame = self._intake.frame
             if frame != repr(self._frame):
