@@ -45,7 +45,7 @@ class Tracks2:
     speed_spread: Floats
 
     def __len__(self) -> int:
-        return self.place.shape[1]
+        return int(self.place.shape[1])
 
 
 def match(one: Tracks2, other: Tracks2, site: Floats, sigma: Floats) -> tuple[Ints, Ints]:
