@@ -24,7 +24,8 @@ START = 1_780_000_000 * SECOND
 @dataclass(frozen=True)
 class Offset:
     """A source: where it stands, m; its errors (s, m, m, rad, m, 1; as `bias` has them); sigma of places and
-    velocities; correlation of successive errors of a track; drift of its clock, s/s."""
+    velocities; lasting: correlation of successive errors of a track; tracker: its tracks are those of Kalman filters,
+    of detections each second with the sigma of places; drift of its clock, s/s."""
 
     place: tuple[float, float] = (0.0, 0.0)
     clock: float = 0.0
@@ -37,6 +38,7 @@ class Offset:
     lasting: float = 0.0
     drift: float = 0.0
     polar: bool = False
+    tracker: bool = False
 
     def says(self, states: Floats) -> Floats:
         """What it says of true states (T, 4), written down anew from the geometry: polar coordinates about it."""
@@ -54,12 +56,12 @@ class World:
     def __init__(
         self, offsets: Mapping[str, Offset], count: int = 25, speed: float = 200.0, seed: int = 1, *,
         spread: float = 30_000.0, courses: Sequence[float] | None = None,
-        seen: Mapping[str, Sequence[int]] | None = None,
+        seen: Mapping[str, Sequence[int]] | None = None, varied: float = 0.2,
         **config: Any,
     ) -> None:  # fmt: skip
         self.rng, self.sources = np.random.default_rng(seed), dict(offsets)
         course = self.rng.uniform(0, 2 * np.pi, count) if courses is None else np.resize(courses, count)
-        speeds = speed * self.rng.uniform(0.8, 1.2, count)
+        speeds = speed * self.rng.uniform(1 - varied, 1 + varied, count)
         self.begin = np.concatenate(
             [
                 self.rng.uniform(-spread, spread, (count, 2)),
@@ -72,6 +74,7 @@ class World:
         frame = {"kind": "enu", "lat": FRAME.lat, "lon": FRAME.lon}
         self.config = {"frame": frame, "lateness": 3.0, **config}
         self.centre = FusionCentre(self.config)
+        self.tracks: dict[str, tuple[Floats, Floats]] = {}
         self.second, self.epoch = 0, dict.fromkeys(offsets, 1)
         for name in self.sources:
             self.inform(name)
@@ -105,14 +108,29 @@ class World:
             self.errors[name] = a * self.errors[name] + np.sqrt(1 - a * a) * self._error(one)
             clock = one.clock + one.drift * self.second
             says = one.says(self.truth(self.second - clock)) + self.errors[name]
+            spread = np.diag(np.repeat(one.sigma, 2) ** 2)
+            if one.tracker:
+                says, spread = self._tracked(name, says)
             some = self.seen[name]
             message = schemas.LocalTracks(
                 source=name, epoch=self.epoch[name], seq=self.second, sent=START, time=START + self.second * SECOND,
                 complete=True, space=SPACE, frame=FRAME, ids=np.array(some, dtype=np.uint64) + np.uint64(1),
-                means=says[some], covariances=np.tile(np.diag(np.repeat(one.sigma, 2) ** 2), (len(some), 1, 1)),
+                means=says[some], covariances=np.tile(spread, (len(some), 1, 1)),
             )  # fmt: skip
             self.centre.handle(message, START + self.second * SECOND + SECOND // 10)
         return self.centre.step(START + self.second * SECOND)
+
+    def _tracked(self, name: str, detected: Floats) -> tuple[Floats, Floats]:
+        """States (T, 4) and the covariance of each, after detections with what `detected` says of places."""
+        x, P = self.tracks.get(name, (detected, np.diag(np.repeat(self.sources[name].sigma, 2) ** 2)))
+        F, q = np.kron([[1.0, 1.0], [0.0, 1.0]], np.eye(2)), np.kron([[1 / 3, 1 / 2], [1 / 2, 1.0]], np.eye(2))
+        if name in self.tracks:
+            H, R = np.eye(4)[:2], np.eye(2) * self.sources[name].sigma[0] ** 2
+            x, P = x @ F.T, F @ P @ F.T + q
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + R)
+            x, P = x + (detected[:, :2] - x @ H.T) @ K.T, (np.eye(4) - K @ H) @ P
+        self.tracks[name] = x, (P + P.T) / 2
+        return self.tracks[name]
 
     def run(self, seconds: int) -> StepResult:
         """Several."""

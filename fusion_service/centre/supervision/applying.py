@@ -8,6 +8,7 @@ after some steps in a row, and no more when it falls below a much lower bound.
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -72,9 +73,9 @@ def decide(before: Applied, told: Told, effect: Floats, errors: float, corrects:
         x = told.mean[some] / scale
         square = float(x @ np.linalg.solve(inner + 1e-12 * np.eye(size), x))
     sure, fair = 1.0 - min(errors * LOOK / 3600.0, 0.1), 0.5
-    passes = size > 0 and square > chi2_quantile(sure, size) and effect[0] > MATTERS
+    passes = size > 0 and square > _quantile(sure, size) and bool(effect[0] > MATTERS)
     looks = before.looks + 1 if passes else 0
-    holds = size > 0 and square > chi2_quantile(fair, size) and effect[0] > HARDLY
+    holds = size > 0 and square > _quantile(fair, size) and bool(effect[0] > HARDLY)
     found = (before.found and holds) or looks >= IN_A_ROW
     on = found and corrects
     loose = bool(effect[1] > (LOOSE / 2 if before.loose else LOOSE))
@@ -85,3 +86,8 @@ def decide(before: Applied, told: Told, effect: Floats, errors: float, corrects:
     if found == before.found and on == before.on and not moved:
         return after, False
     return replace(after, told=told.mean.copy(), sigma=told.spread), True
+
+
+@lru_cache(maxsize=64)
+def _quantile(probability: float, size: int) -> float:
+    return float(chi2_quantile(probability, size))

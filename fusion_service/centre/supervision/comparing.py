@@ -17,7 +17,7 @@ from fusion_service.centre.supervision.lasting import Lasting
 
 __all__ = ["MOST_TARGETS", "Compared", "Treated", "chosen_rows", "compared", "labels"]
 
-MOST_TARGETS = 96
+MOST_TARGETS = 48
 """Shared targets that are looked at in a step; of more those whose turn it is, for some time in a row."""
 TURN = 64
 """Steps."""
@@ -95,17 +95,31 @@ def compared(
     ids, start, group = np.unique(label[row], return_index=True, return_inverse=True)
     at = now.find(ids)
     place = now.mean[[space.index("x"), space.index("y")]][:, at]
-    moves = "vx" in space and "vy" in space
-    velocity = now.mean[[space.index("vx"), space.index("vy")]][:, at] if moves else np.zeros_like(place)
+    velocity = np.zeros_like(place)
+    if "vx" in space and "vy" in space:
+        v = [space.index("vx"), space.index("vy")]
+        velocity = _calibrated(now.mean[v][:, at], sum(now.covariance[k, k, at] for k in v))
     H = design(place[:, group], velocity[:, group], how.site[:, source])
     xy = [space.index("x"), space.index("y")]
     value = how.value[source]
     z = rows.tracks.mean[xy][:, row] - place[:, group]
     z = z + sum(H[:, k] * value[:, k] for k in range(value.shape[1]))
     own = rows.tracks.covariance[np.ix_(xy, xy)][..., row]
-    own = _own(own, H, how.common[source], how.shift[..., source])
+    if how.common.any() or how.shift.any():
+        own = _own(own, H, how.common[source], how.shift[..., source])
     made = Group(source, group, start, H, z, inverse_2x2(own))
     return Compared(row, made, own, place, velocity)
+
+
+def _calibrated(velocity: Floats, noise: Floats) -> Floats:
+    """Velocities (2, G) as they are to be expected of targets whose own differ by no more than they seem to: noise (G,)
+    in what an error is multiplied by would tell a clock from a shift where nothing does (regression calibration)."""
+    if velocity.shape[1] < 2:
+        return velocity
+    mean = velocity.mean(axis=1, keepdims=True)
+    apart = velocity - mean
+    own = max(float((apart**2).sum()) / (velocity.shape[1] - 1) - float(noise.mean()), 0.0)
+    return np.asarray(mean + apart * (own / (own + noise)))
 
 
 def _own(spread: Floats, H: Floats, common: Floats, shift: Floats) -> Floats:

@@ -20,7 +20,7 @@ from fusion_service.centre.supervision.bias import PARAMETERS
 __all__ = ["Group", "Information", "Posterior", "inverse_2x2"]
 
 P = len(PARAMETERS)
-TIGHT = 1e-3
+TIGHT = 1e-4
 """Of what is supposed beforehand: how exactly a gauge is kept."""
 LOST = 1e-9
 """Information that is nothing, beside what is supposed beforehand."""
@@ -147,7 +147,7 @@ class Information:
         of errors, each in units of its sigma, kept at 0."""
         free = np.flatnonzero(sigma.ravel() > 0)
         scale = sigma.ravel()[free]
-        flat, sums = self.matrix.reshape(sigma.size, -1), gauge.reshape(len(gauge), sigma.size)[:, free] / TIGHT
+        flat, sums = self.matrix.reshape(sigma.size, sigma.size), gauge.reshape(len(gauge), sigma.size)[:, free] / TIGHT
         A = np.eye(len(free)) + flat[np.ix_(free, free)] * scale[:, None] * scale + sums.T @ sums
         inverse = np.linalg.inv(0.5 * (A + A.T)) if len(free) else np.zeros((0, 0))
         inverse = 0.5 * (inverse + inverse.T) * scale[:, None] * scale

@@ -18,7 +18,7 @@ import numpy as np
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.supervision.bias import PARAMETERS, RANGE
 
-__all__ = ["SHARED", "connected", "gauge", "gauge_words"]
+__all__ = ["SHARED", "connected", "gauge", "gauge_weights", "gauge_words"]
 
 SHARED = 0.5
 """Shared targets, faded, from which two sources are connected."""
@@ -41,11 +41,23 @@ def connected(shared: Floats) -> Ints:
     return label
 
 
-def gauge(
-    sigma: Floats, label: Ints, reference: Bools, mean: Floats | None = None, variance: Floats | None = None
-) -> Floats:
-    """Sums (K, S, 6), in units of sigma (S, 6), that are kept at 0; mean, variance (S, 6): the estimate in any other
-    gauge, by which those that agree are found; left out: all weigh by their sigma alone."""
+def gauge_weights(sigma: Floats, label: Ints, mean: Floats, variance: Floats) -> Floats:
+    """How much each error (S, 6) weighs among those of the sources that hang together, besides its sigma (S, 6), by an
+    estimate (mean, variance) in whatever gauge: 1 at the median."""
+    weight = np.ones(sigma.shape)
+    for first in np.unique(label).tolist():
+        mine = np.flatnonzero(label == first)
+        for parameter in KEPT:
+            some = mine[sigma[mine, parameter] > 0]
+            if len(some) > 2:
+                off = mean[some, parameter] - np.median(mean[some, parameter])
+                spread = variance[some, parameter] + (FLOOR * sigma[some, parameter]) ** 2
+                weight[some, parameter] = spread / (spread + off**2)
+    return weight
+
+
+def gauge(sigma: Floats, label: Ints, reference: Bools, weights: Floats) -> Floats:
+    """Sums (K, S, 6), in units of sigma (S, 6), that are kept at 0; weights (S, 6) as `gauge_weights` gives them."""
     rows = []
     for first in np.unique(label).tolist():
         mine = np.flatnonzero(label == first)
@@ -55,13 +67,8 @@ def gauge(
             some = mine[sigma[mine, parameter] > 0]
             if len(some) < 2:
                 continue
-            weight = 1.0 / sigma[some, parameter] ** 2
-            if mean is not None and variance is not None:
-                off = mean[some, parameter] - np.median(mean[some, parameter])
-                spread = variance[some, parameter] + (FLOOR * sigma[some, parameter]) ** 2
-                weight = weight * spread / (spread + off**2)
             row = np.zeros(sigma.shape)
-            row[some, parameter] = weight * sigma[some, parameter]
+            row[some, parameter] = weights[some, parameter] / sigma[some, parameter]
             rows.append(row / np.sqrt((row**2).sum()))
     return np.stack(rows) if rows else np.zeros((0, *sigma.shape))
 

@@ -7,8 +7,8 @@ beside the others of its target, of two successive blocks of N data with sums Q1
     t = (|Q1|^2 + |Q2|^2 + 4 Q1'Q2) / (4 N)
 
 has the expectation of that ratio but for terms that fall off with N as the autocorrelation does (twice the mean square
-of the sum of 2 N less that of N: what the ends of a block miss cancels). What is found of a row is shared between it
-and the others as their variances are (one step of the EM algorithm for variance components). Until blocks are full, the
+of the sum of 2 N less that of N: what the ends of a block miss cancels). A row counts by its share in the variance of
+its residual, so that what is found is put down to the source that it comes from. Until blocks are full, the
 autocorrelation phi of successive residuals stands for it: (1 + phi) / (1 - phi).
 """
 
@@ -29,9 +29,9 @@ BLOCK = 16
 """Data of a row."""
 FIRST_PHI, FIRST_DATA = 0.6, 50.0
 """Autocorrelation that is supposed, and from how many data."""
-FIRST_BLOCKS = 20.0
+FIRST_BLOCKS = 10.0
 LEAST, MOST = 0.05, 1e4
-REMEMBERED = 2000.0
+REMEMBERED = 500.0
 """Blocks that a ratio is made of at most; older ones fade."""
 MOST_FOLLOWED = 10_000
 FAR = 16.0
@@ -58,7 +58,7 @@ class Followed:
 
 class Lasting:
     """Of the sources of an estimate (S,): first, second: sums of |q|^2 and of products of successive q; found, blocks:
-    sum of ratios and their number."""
+    sum of ratios, weighted, and of weights."""
 
     def __init__(self, count: int = 0) -> None:
         self.first, self.second = np.zeros(count), np.zeros(count)
@@ -125,9 +125,8 @@ class Lasting:
         one, two = block[:, 0, full], block[:, 1, full]
         found = ((one**2).sum(axis=0) + (two**2).sum(axis=0) + 4.0 * (one * two).sum(axis=0)) / (4.0 * BLOCK)
         whose, part = group.source[full], share[full]
-        part = ratio[whose] * (1.0 - part + part * found)
-        self.found += np.bincount(whose, part, minlength=size)
-        self.blocks += np.bincount(whose, minlength=size)
+        self.found += np.bincount(whose, part * ratio[whose] * found, minlength=size)
+        self.blocks += np.bincount(whose, part, minlength=size)
         kept = np.minimum(1.0, REMEMBERED / np.maximum(self.blocks, 1.0))
         self.found, self.blocks = kept * self.found, kept * self.blocks
         data[full], block[..., full] = 0, 0.0

@@ -26,12 +26,12 @@ from fusion_service.centre.supervision.bias import CLOCK, PARAMETERS, prior_sigm
 from fusion_service.centre.supervision.comparing import Compared, Treated, chosen_rows, compared, labels
 from fusion_service.centre.supervision.correction import Bias
 from fusion_service.centre.supervision.estimate import Information, Posterior
-from fusion_service.centre.supervision.gauge import connected, gauge, gauge_words
+from fusion_service.centre.supervision.gauge import connected, gauge, gauge_weights, gauge_words
 from fusion_service.centre.supervision.lasting import Lasting, robust
 from fusion_service.centre.supervision.shared import Shared
 from fusion_service.centre.supervision.unlinked import Unlinked
 from fusion_service.centre.treatment import Correction
-from schemas import Ecef
+from schemas import Ecef, SensorInfo
 
 __all__ = ["Registration"]
 
@@ -68,6 +68,8 @@ class Registration:
         self._epochs: dict[str, int] = {}
         self._applied: dict[str, Applied] = {}
         self._known: _Known | None = None
+        self._weights = np.zeros((0, P))
+        self._standings: dict[str, tuple[SensorInfo | None, Floats, Floats]] = {}
         self._unlinked = Unlinked()
         self._step, self._time = 0, -1
 
@@ -127,7 +129,8 @@ class Registration:
                 after[to[to >= 0]] = before[to >= 0]
                 setattr(self, name, after)
             self._applied = {name: one for name, one in self._applied.items() if name in new}
-            self._known = None
+            self._standings = {name: one for name, one in self._standings.items() if name in new}
+            self._known, self._weights = None, np.ones((len(new), P))
         for at, name in enumerate(new):
             epoch = self._intake.sources[name].epoch
             if self._epochs.get(name, epoch) != epoch:
@@ -149,7 +152,7 @@ class Registration:
         xy = [config.space.index(axis) for axis in ("x", "y")]
         sites = np.zeros((2, count))
         for at, name in enumerate(names):
-            sites[:, at] = site_of(self._intake, self._intake.sources[name])
+            sites[:, at] = self._standing(name)[1]
             applied = self._applied.get(name)
             if applied is not None and applied.on:
                 value[at], common[at] = applied.value, applied.covariance
@@ -196,13 +199,23 @@ class Registration:
 
     def _estimate(self, sites: Floats) -> None:
         names, info = self._information.names, self._information
-        sources = [self._intake.sources[name] for name in names]
-        sigma = np.array([prior_sigma(self._intake, source) for source in sources]).reshape(-1, P)
+        sigma = np.array([self._standing(name)[0] for name in names]).reshape(-1, P)
         reference = np.array([self._intake.config.source(name).reference for name in names], dtype=np.bool_)
         label = connected(info.shared)
-        first = info.posterior(sigma, gauge(sigma, label, reference))
-        posterior = info.posterior(sigma, gauge(sigma, label, reference, first.mean, first.variance))
+        if self._known is not None:
+            before = self._known.posterior
+            self._weights = gauge_weights(sigma, label, before.mean, before.variance)
+        posterior = info.posterior(sigma, gauge(sigma, label, reference, self._weights))
         self._known = _Known(sigma, label, reference, posterior, sites)
+
+    def _standing(self, name: str) -> tuple[Floats, Floats]:
+        """How large the errors of a source may be (6,), and its place (2,); kept while it says the same of itself."""
+        source = self._intake.sources[name]
+        kept = self._standings.get(name)
+        if kept is None or kept[0] is not source.info:
+            kept = source.info, prior_sigma(self._intake, source), site_of(self._intake, source)
+            self._standings[name] = kept
+        return kept[1:]
 
     def _weigh(self, part: Compared) -> None:
         """How large the errors, and what stays of them, are beside those that the rows have of their own: (S, 2), mean
@@ -265,6 +278,12 @@ class Registration:
             "bias_note": telling.note(told, applied.on, applied.found, corrects),
         }
 
+    def estimate(self, name: str) -> tuple[Floats, Floats]:
+        """The errors of a source: mean (6,) and covariance (6, 6). KeyError where it is in no estimate."""
+        if self._known is None or name not in self._information.names:
+            raise KeyError(name)
+        return self._known.posterior.of(self._information.names.index(name))
+
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns."""
         self._time = min(self._time, time)
@@ -278,6 +297,7 @@ class Registration:
             "lasting": self._lasting.packed(),
             "seen": to_bytes(self._seen),
             "effect": to_bytes(self._effect),
+            "weights": to_bytes(self._weights),
             "epochs": dict(self._epochs),
             "applied": {name: one.packed() for name, one in sorted(self._applied.items())},
             "unlinked": self._unlinked.packed(),
@@ -295,6 +315,7 @@ class Registration:
         like = np.zeros(0)
         self._seen = from_bytes(packed["seen"], like).reshape(-1, SEEN)
         self._effect = from_bytes(packed["effect"], like).reshape(-1, 2)
+        self._weights = from_bytes(packed["weights"], like).reshape(-1, P)
         self._epochs = {str(name): int(epoch) for name, epoch in packed["epochs"].items()}
         self._applied = {str(name): Applied.unpacked(one) for name, one in packed["applied"].items()}
         self._unlinked.restore(packed["unlinked"])

@@ -70,7 +70,7 @@ def _why(told: Told, parameter: int) -> str:
     if parameter in (CLOCK, X, Y) and values[0] < ONE_WAY * values[1] and values[1] > SLOW**2:
         way = axes[:, 1]
         mean = float(told.seen[1] * way[0] + told.seen[2] * way[1]) / count
-        if mean**2 > 0.5 * float(values[1]) and (parameter == CLOCK or abs(way[parameter - X]) > 0.3):
+        if mean**2 > 0.3 * float(values[1]) and (parameter == CLOCK or abs(way[parameter - X]) > 0.3):
             c = np.zeros(len(PARAMETERS))
             c[CLOCK], c[X], c[Y] = -mean, *way
             known = math.sqrt(max(float(c @ told.covariance @ c), 0.0))
