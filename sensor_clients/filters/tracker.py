@@ -119,10 +119,12 @@ class LocalTracker:
         clutter: Floats,
         birth: Floats,
         detection: Callable[[Floats], Floats],
+        hidden: Callable[[Floats], NDArray[np.bool_]] | None = None,
     ) -> Floats:
         """One scan at `time`, ns: returns (2, M), with the intensities of clutter and of first returns of new
         targets at each (M,), per unit of measurement space; `detection` gives the probability (T,) that a
-        target at a place (2, T) is seen: 0 outside the field of view, where tracks end.
+        target at a place (2, T) is seen: 0 outside the field of view, where tracks end; `hidden`, which places
+        (2, T) are such that what is seen there proves nothing new: no track is confirmed there, nor gains way.
 
         Returns the probability (M,) that each return is of no reported track."""
         config = self.config
@@ -133,8 +135,9 @@ class LocalTracker:
         self.updated = np.where(found.missed < 0.5, time, self.updated)
         self._prune()
         self._start(returns, model, found.unused * birth / (clutter + birth))
-        self.farthest = np.maximum(self.farthest, self._way(model))
-        self.confirmed = self.confirmed | (self.existence >= config.confirm)
+        proves = np.ones(len(self.ids), dtype=np.bool_) if hidden is None else ~hidden(self.means[:2])
+        self.farthest = np.where(proves, np.maximum(self.farthest, self._way(model)), self.farthest)
+        self.confirmed = self.confirmed | (proves & (self.existence >= config.confirm))
         return np.asarray(1.0 - claimed)
 
     def reported(self) -> NDArray[np.bool_]:

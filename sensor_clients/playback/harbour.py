@@ -12,6 +12,7 @@ from sensor_clients.events import Parameter
 from sensor_clients.filters import LocalTracker, Position, Report, TrackerConfig
 from sensor_clients.filters.measurement import Floats
 from sensor_clients.playback.following import ClutterMap, follow, parameters
+from sensor_clients.playback.shadow import Shade
 
 __all__ = ["LIDAR", "RADAR", "HarbourSensor", "HarbourTracker", "cluster"]
 
@@ -21,6 +22,7 @@ SOURCES = {
     "coverage": "chosen",
     "coverage_detection": "chosen",
     "initiation_delay": "chosen",
+    "shade": "the larger of the two vessels, 36 by 10 m, half the beam of such a radar, 2.6 deg; 0.3 chosen",
 }
 """Where each number comes from; all others are `following.TUNED`."""
 
@@ -36,7 +38,7 @@ class HarbourSensor:
     returns nearer than this are the own ship's; reach: returns beyond are not looked at; detection: range and
     probability that a vessel is seen, linear between; clutter, births: intensities of false returns (before
     any are learned) and of vessels seen for the first time; map_sigma, map_scans: of the `ClutterMap`;
-    coverage, coverage_detection, initiation_delay: what the info says.
+    coverage, coverage_detection, initiation_delay: what the info says; shade: what vessels hide of one another.
     """
 
     name: str
@@ -59,6 +61,7 @@ class HarbourSensor:
     coverage: float
     coverage_detection: float
     initiation_delay: float
+    shade: Shade | None
     tracker: TrackerConfig
 
     def parameters(self) -> list[Parameter]:
@@ -87,6 +90,7 @@ LIDAR = HarbourSensor(
     coverage=75.0,
     coverage_detection=0.8,
     initiation_delay=4.0,
+    shade=Shade(36.0, 10.0, 0.0, 0.3),
     tracker=TrackerConfig(
         motion=Motion("cv", 0.05),
         survival=0.99,
@@ -116,8 +120,8 @@ RADAR = HarbourSensor(
     reference=1.5,
     cluster=5.0,
     blind=7.0,
-    reach=300.0,
-    detection=((0.0, 0.8), (300.0, 0.8)),
+    reach=500.0,
+    detection=((0.0, 0.8), (500.0, 0.8)),
     clutter=1e-5,
     births=1e-7,
     map_sigma=35.0,
@@ -125,6 +129,7 @@ RADAR = HarbourSensor(
     coverage=250.0,
     coverage_detection=0.8,
     initiation_delay=10.0,
+    shade=Shade(36.0, 10.0, 0.023, 0.3),
     tracker=TrackerConfig(
         motion=Motion("cv", 0.08),
         survival=0.99,
@@ -171,7 +176,7 @@ class HarbourTracker:
             returns = returns + sensor.offset * sight / distance
         returns = cluster(returns, sensor.cluster)
         model = Position(sensor.sigma_range, sensor.sigma_cross, sensor.sigma_azimuth, (float(own[0]), float(own[1])))
-        follow(self.tracker, self.clutter, sensor, time, own, returns, model, beyond=0.0)
+        follow(self.tracker, self.clutter, sensor, time, own, returns, model, beyond=0.0, shade=sensor.shade)
         return True
 
     def report(self, time: int) -> Report:
