@@ -24,6 +24,8 @@ from fusion_service.config import CentreConfig
 
 __all__ = ["FusionCentre"]
 
+NOTHING: NDArray[np.uint64] = np.zeros(0, dtype=np.uint64)
+
 
 class FusionCentre(Centre):
     """Links local tracks to global ones and fuses, in every step, those of each global track. Arguments as for
@@ -134,7 +136,9 @@ class FusionCentre(Centre):
         sources = np.bincount(at[(expected >= time) & counted], minlength=count)
         hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
         linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
-        return Support(sources, hit, due, slowest, linked == 0, self._last)
+        unlisted = [links for source in self._intake.sources.values() for links in source.dropped]
+        dropped = (linked == 0) & np.isin(self._picture.id, np.concatenate([NOTHING, *unlisted]))
+        return Support(sources, hit, due, slowest, linked == 0, dropped, self._last)
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()

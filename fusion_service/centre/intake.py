@@ -193,7 +193,7 @@ class Intake:
         self._dead = None
         for source in self.sources.values():
             source.waited += len(source.tracks.id) > 0 and source.info is None
-            source.scans, source.ahead, source.arrived, source.pairs = 0, -1, [], []
+            source.scans, source.ahead, source.arrived, source.dropped, source.pairs = 0, -1, [], [], []
         for name, found in sorted(self._present.items()):
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):

@@ -261,8 +261,8 @@ class Source:
     interval: between its scans, ns, measured (-1: not yet). remembered: its tracks that went stale. vote: the frame it
     speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason.
     lag: how far behind the last step its messages come, ns, about the longest of late. Of the step being made:
-    arrived, the ids that came; pairs, their versions, where those are followed; ahead, the time of the newest message
-    that is for a later one.
+    arrived, the ids that came; dropped, the links of tracks that complete scans list no more; pairs, the versions of
+    what came, where those are followed; ahead, the time of the newest message that is for a later one.
     """
 
     name: str
@@ -288,6 +288,7 @@ class Source:
     why: str = ""
     unused: dict[str, int] = field(default_factory=dict)
     arrived: list[NDArray[np.uint64]] = field(default_factory=list)
+    dropped: list[NDArray[np.uint64]] = field(default_factory=list)
     ahead: int = -1
     lag: int = 0
     pairs: list[Pair] = field(default_factory=list)
@@ -301,7 +302,7 @@ class Source:
         self.epoch, self.info, self.waited, self.last, self.complete = epoch, None, 0, -1, -1
         self.tracks = empty_tracks(len(self.space))
         self.interval, self.remembered, self.why, self.arrived = -1, NOTHING_REMEMBERED, "", []
-        self.lag, self.pairs = 0, []
+        self.lag, self.dropped, self.pairs = 0, [], []
         self.highest, self.first, self.seen, self.seen_set = {}, {}, deque(), set()
 
     def leave(self, reason: str, count: int) -> None:
@@ -346,12 +347,13 @@ class Source:
         old = self.tracks if space == self.space else empty_tracks(len(space))
         new = replace(new, interval=intervals(new.id, new.time, self._known(old), pace))
         merged, pair = newest(old, new), successive(old, new) if versions else None
-        end = messages[-1].time
+        end, gone = messages[-1].time, merged.link[:0]
         if complete and end >= self.complete:
-            listed = np.isin(merged.id, messages[-1].ids)
-            merged = merged.take(listed | (merged.time > end))
+            listed = np.isin(merged.id, messages[-1].ids) | (merged.time > end)
+            merged, gone = merged.take(listed), merged.link[~listed]
         if len(merged.id) > most:
             return False
+        self.dropped.append(gone)
         if complete:
             self.scans += end >= self.complete
             self.complete = max(self.complete, end)
