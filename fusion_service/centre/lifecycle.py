@@ -38,9 +38,9 @@ class Picture:
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
     overdue (of one that was dropped: so long ago that its time is up with the next report); interval i64 between
-    reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last; existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; lineage i32 code of the sources
-    whose data are in the density (-1: not known); motion i32 code (see `motions`); way u8 index into `WAYS` of what
-    it was last fused by.
+    reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last; existence, and opinion (NaN:
+    none yet) and evidence, the log-odds it is made of; lineage i32 code of the sources whose data are in the density
+    (-1: not known); motion i32 code (see `motions`); way u8 index into `WAYS` of what it was last fused by.
     """
 
     id: NDArray[np.uint64]
