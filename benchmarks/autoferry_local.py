@@ -61,6 +61,8 @@ def perturbed(sensor: HarbourSensor, rng: np.random.Generator) -> HarbourSensor:
             return replace(value, q=value.q * factor)
         if isinstance(value, Shade):
             return Shade(*(getattr(value, field.name) * FACTOR ** rng.uniform(-1, 1) for field in fields(value)))
+        if isinstance(value, tuple) and isinstance(value[0], float):
+            return tuple(change(one) for one in value)
         if isinstance(value, tuple):
             return tuple((distance * factor, probability) for distance, probability in value)
         if isinstance(value, float) and 0.5 < value < 1.0:

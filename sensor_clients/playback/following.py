@@ -80,7 +80,8 @@ def follow(
     shadows = None
     if shade is not None:
         tracker.predict(true)
-        shadows = cast(own, tracker.means[:, tracker.reported()], shade)
+        chosen = tracker.reported()
+        shadows = cast(own, tracker.means[:, chosen], tracker.covariances[..., chosen], shade)
 
     def detection(place: Floats) -> Floats:
         p = np.asarray(np.interp(np.hypot(*(place - own[:, None])), ranges, probabilities, right=beyond))
@@ -88,7 +89,7 @@ def follow(
 
     clutter = clutter_map.intensity(returns)
     births = np.full(len(clutter), sensor.births)
-    hidden = None if shadows is None else shadows.over
+    hidden = None if shadows is None else shadows.unproven
     unused = tracker.step(true, returns, model, clutter, births, detection, hidden)
     clutter_map.learn(returns, unused)
 
