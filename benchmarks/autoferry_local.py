@@ -25,6 +25,7 @@ from schemas import LocalTracks, Message, Motion, SensorInfo, Truth
 from sensor_clients.events import Event
 from sensor_clients.playback import autoferry
 from sensor_clients.playback.harbour import LIDAR, RADAR, HarbourSensor
+from sensor_clients.playback.shadow import Shade
 
 SCENARIOS = (2, 3, 5, 13, 16)
 FACTOR = 1.3
@@ -58,6 +59,10 @@ def perturbed(sensor: HarbourSensor, rng: np.random.Generator) -> HarbourSensor:
         factor = FACTOR ** rng.uniform(-1, 1)
         if isinstance(value, Motion):
             return replace(value, q=value.q * factor)
+        if isinstance(value, Shade):
+            return Shade(*(getattr(value, field.name) * FACTOR ** rng.uniform(-1, 1) for field in fields(value)))
+        if isinstance(value, tuple) and isinstance(value[0], float):
+            return tuple(change(one) for one in value)
         if isinstance(value, tuple):
             return tuple((distance * factor, probability) for distance, probability in value)
         if isinstance(value, float) and 0.5 < value < 1.0:

@@ -28,6 +28,8 @@ from fusion_service.config import CentreConfig
 
 __all__ = ["FusionCentre"]
 
+NOTHING: NDArray[np.uint64] = np.zeros(0, dtype=np.uint64)
+
 
 class FusionCentre(Centre):
     """Links local tracks to global ones and fuses, in every step, those of each global track. Arguments as for
@@ -172,7 +174,10 @@ class FusionCentre(Centre):
         linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
         whole = np.full(len(rows.source), -1, dtype=np.int64)
         whole[inside] = expected
-        return Support(sources, hit, due, slowest, shared.support(due, whole, linked == 0), self._last)
+        left = shared.support(due, whole, linked == 0)
+        unlisted = [links for source in self._intake.sources.values() for links in source.dropped]
+        dropped = left & np.isin(self._picture.id, np.concatenate([NOTHING, *unlisted]))
+        return Support(sources, hit, due, slowest, left, dropped, self._last)
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()

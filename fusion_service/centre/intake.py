@@ -199,7 +199,8 @@ class Intake:
         self._dead = None
         for source in self.sources.values():
             source.waited += len(source.tracks.id) > 0 and source.info is None
-            source.scans, source.ahead, source.came, source.arrived, source.pairs = 0, -1, [], [], []
+            source.scans, source.ahead, source.pairs = 0, -1, []
+            source.came, source.arrived, source.dropped = [], [], []
         for name, found in sorted(self._present.items()):
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):

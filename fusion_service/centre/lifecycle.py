@@ -5,8 +5,9 @@ predicts on, its `updated` standing still, gives none). A track is confirmed by 
 were due, at the pace of its own sources, or at once by several sources. It coasts when the next report of every
 contributor is overdue, and ends after `coast` seconds or `coast_periods` of the slowest contributor, whichever is
 longer; a tentative one when N reports were due without a hit. One whose existence falls below `min_existence` is
-tentative again, and ends when overdue. One whose local tracks its sources have all dropped is overdue since the
-last step that had one. How often the centre steps changes nothing of this.
+tentative again, and ends when overdue. Coasting is for silence: a track whose last local track is missing from a
+complete scan of its source ends unless the next report that is expected brings it back. One that has lost its local
+tracks otherwise is overdue since the last step that had one. How often the centre steps changes nothing of this.
 """
 
 from __future__ import annotations
@@ -36,10 +37,11 @@ class Picture:
     log_weight (C, G), part_mean (n, C, G), part_covariance (n, n, C, G): components as in `sources.Tracks`.
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
-    overdue; interval i64 between reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last;
-    existence, and opinion (NaN: none yet) and evidence, the log-odds it is made of; lineage i32 code of the sources
-    whose data are in the density (-1: not known); motion i32 code (see `motions`); way u8 index into `WAYS` of what
-    it was last fused by; extent (E, G), fused, E = 0 where nothing is known of any (see `extents`).
+    overdue (of one that was dropped: so long ago that its time is up with the next report); interval i64 between
+    reports, ns; hits u64, the last reports due as bits; last_hit i64 step of the last; existence, and opinion (NaN:
+    none yet) and evidence, the log-odds it is made of; lineage i32 code of the sources whose data are in the density
+    (-1: not known); motion i32 code (see `motions`); way u8 index into `WAYS` of what it was last fused by; extent
+    (E, G), fused, E = 0 where nothing is known of any (see `extents`).
     """
 
     id: NDArray[np.uint64]
@@ -122,13 +124,15 @@ def newborn(ids: NDArray[np.uint64], n: int, time: int) -> Picture:
 class Support:
     """What feeds G global tracks in a step. sources (G,): how many sources whose next report is not overdue; hit (G,):
     whether a new measurement came in; due (G,): ns at which the next report of the last of them is overdue, -1 where
-    none is believed; interval (G,): ns between reports of the slowest of them; dropped (G,): no local track is linked
-    any more: what it was made of is gone from its sources' scans. before: ns of the last step."""
+    none is believed; interval (G,): ns between reports of the slowest of them; left (G,): no local track is linked any
+    more; dropped (G,): nor is it because a complete scan of this step did not list the last of them. before: ns of the
+    last step."""
 
     sources: NDArray[np.intp]
     hit: NDArray[np.bool_]
     due: NDArray[np.int64]
     interval: NDArray[np.int64]
+    left: NDArray[np.bool_]
     dropped: NDArray[np.bool_]
     before: int
 
@@ -137,7 +141,7 @@ def advance(picture: Picture, time: int, support: Support, config: CentreConfig)
     """Every life at the step at `time`, ns: the picture with new status, and which tracks end now."""
     linked = support.due >= 0
     due = np.where(linked, support.due, picture.due)
-    due = np.where(support.dropped, np.minimum(due, support.before), due)
+    due = np.where(support.left, np.minimum(due, support.before), due)
     interval = np.where(linked, support.interval, picture.interval)
     hits, last = _counted(picture, time, support, interval, config)
     overdue = time > due
@@ -149,7 +153,9 @@ def advance(picture: Picture, time: int, support: Support, config: CentreConfig)
     status = np.where(weak, TENTATIVE, status)
     coast = np.maximum(round(config.coast * 1e9), _times(interval, config.coast_periods))
     waiting = _times(interval, max(config.confirm_within - 1.5, 0.0))
-    ended = overdue & ((time - due > np.where(status == TENTATIVE, waiting, coast)) | weak)
+    patience = np.where(status == TENTATIVE, waiting, coast)
+    due = np.where(support.dropped, np.minimum(due, time + interval + interval // 2 - patience), due)
+    ended = overdue & ((time - due > patience) | weak)
     status = status.astype(np.uint8)
     return replace(picture, status=status, hits=hits, last_hit=last, due=due, interval=interval), ended
 

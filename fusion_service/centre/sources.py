@@ -281,8 +281,8 @@ class Source:
     speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason.
     lag: how far behind the last step its messages come, ns, about the longest of late. places: of its newest messages
     that say one. Of the step being made: came, the time of each message with tracks, and when it came, ns; arrived, the
-    ids that came; pairs, their versions, where those are followed; ahead, the time of the newest message that is for a
-    later one.
+    ids that came; dropped, the links of tracks that complete scans list no more; pairs, the versions of what came,
+    where those are followed; ahead, the time of the newest message that is for a later one.
     """
 
     name: str
@@ -309,6 +309,7 @@ class Source:
     unused: dict[str, int] = field(default_factory=dict)
     came: list[tuple[int, int]] = field(default_factory=list)
     arrived: list[NDArray[np.uint64]] = field(default_factory=list)
+    dropped: list[NDArray[np.uint64]] = field(default_factory=list)
     ahead: int = -1
     lag: int = 0
     places: tuple[Place, ...] = ()
@@ -323,7 +324,7 @@ class Source:
         self.epoch, self.info, self.waited, self.last, self.complete = epoch, None, 0, -1, -1
         self.tracks = empty_tracks(len(self.space))
         self.interval, self.remembered, self.why, self.arrived = -1, NOTHING_REMEMBERED, "", []
-        self.lag, self.pairs, self.places = 0, [], ()
+        self.lag, self.dropped, self.pairs, self.places = 0, [], [], ()
         self.highest, self.first, self.seen, self.seen_set = {}, {}, deque(), set()
 
     @property
@@ -374,12 +375,13 @@ class Source:
         old = self.tracks if space == self.space else empty_tracks(len(space))
         new = replace(new, interval=intervals(new.id, new.time, self._known(old), pace))
         merged, pair = newest(old, new), successive(old, new) if versions else None
-        end = messages[-1].time
+        end, gone = messages[-1].time, merged.link[:0]
         if complete and end >= self.complete:
-            listed = np.isin(merged.id, messages[-1].ids)
-            merged = merged.take(listed | (merged.time > end))
+            listed = np.isin(merged.id, messages[-1].ids) | (merged.time > end)
+            merged, gone = merged.take(listed), merged.link[~listed]
         if len(merged.id) > most:
             return False
+        self.dropped.append(gone)
         if complete:
             self.scans += end >= self.complete
             self.complete = max(self.complete, end)

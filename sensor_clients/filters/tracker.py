@@ -27,6 +27,9 @@ from sensor_clients.filters.measurement import STATE, Floats, MeasurementModel, 
 
 __all__ = ["LocalTracker", "Report", "TrackerConfig"]
 
+MOVING = 0.5
+"""Speed, m/s, below which a track has no course."""
+
 
 @dataclass(frozen=True, slots=True)
 class TrackerConfig:
@@ -34,10 +37,13 @@ class TrackerConfig:
     standard deviation per axis of a new track's velocity, m/s; gate: squared Mahalanobis distance;
     confirm, drop: existence at which a track is first reported and at which it ends, for a tentative track
     `drop_tentative`; max_sigma: a track whose position is less certain than this (m, along the worst of
-    its axes) ends; merge: squared distance of two tracks, under the sum of their covariances and `extent`^2
-    (m2) on each axis of the place, below which the younger ends: returns of one large target; min_way,
-    min_speed: a track is reported once it has been so far, m, from where it started, beyond two standard
-    deviations, and as long as that makes this speed over its age, m/s (0: at once); cubature: CKF, else EKF."""
+    its axes) ends, unless it is hidden; merge: squared distance of two tracks, under the sum of their covariances
+    and `extent`^2 (m2) on each axis of the place, below which the younger ends: returns of one large target; hull:
+    length and beam, m, of the largest: half of them as standard deviations along and across the elder's course, in
+    the place of `extent`, so that a `merge` of 4 means no farther apart than the hull (one that lies still: a circle of
+    that area); min_way, min_speed: a track is reported once it has been so far, m, from where it started, beyond two
+    standard deviations, and as long as that makes this speed over its age, m/s (0: at once); cubature: CKF, else
+    EKF."""
 
     motion: Motion
     survival: float
@@ -49,6 +55,7 @@ class TrackerConfig:
     max_sigma: float = math.inf
     merge: float = 0.0
     extent: float = 0.0
+    hull: tuple[float, float] | None = None
     min_way: float = 0.0
     min_speed: float = 0.0
     cubature: bool = True
@@ -119,10 +126,12 @@ class LocalTracker:
         clutter: Floats,
         birth: Floats,
         detection: Callable[[Floats], Floats],
+        hidden: Callable[[Floats], NDArray[np.bool_]] | None = None,
     ) -> Floats:
         """One scan at `time`, ns: returns (2, M), with the intensities of clutter and of first returns of new
         targets at each (M,), per unit of measurement space; `detection` gives the probability (T,) that a
-        target at a place (2, T) is seen: 0 outside the field of view, where tracks end.
+        target at a place (2, T) is seen: 0 outside the field of view, where tracks end; `hidden`, which places
+        (2, T) are such that what is seen there proves nothing new: what is not reported begins anew there.
 
         Returns the probability (M,) that each return is of no reported track."""
         config = self.config
@@ -131,8 +140,10 @@ class LocalTracker:
         self.existence = found.existence
         claimed = np.where(self.reported(), found.existence, 0.0) @ found.weights
         self.updated = np.where(found.missed < 0.5, time, self.updated)
-        self._prune()
+        self._prune(None if hidden is None else hidden(self.means[:2]))
         self._start(returns, model, found.unused * birth / (clutter + birth))
+        if hidden is not None:
+            self._begin_anew(hidden(self.means[:2]) & ~self.reported(), time)
         self.farthest = np.maximum(self.farthest, self._way(model))
         self.confirmed = self.confirmed | (self.existence >= config.confirm)
         return np.asarray(1.0 - claimed)
@@ -212,24 +223,46 @@ class LocalTracker:
             setattr(self, name, np.concatenate([getattr(self, name), values], axis=-1))
         self._next += count
 
+    def _begin_anew(self, some: NDArray[np.bool_], time: int) -> None:
+        """Nothing that `some` tracks (T,) have done counts."""
+        self.first = np.where(some, self.means[:2], self.first)
+        self.born = np.where(some, time, self.born)
+        self.confirmed = self.confirmed & ~some
+        self.farthest = np.where(some, 0.0, self.farthest)
+
     def _worst_sigma(self) -> Floats:
         """Standard deviation (T,) of the place along its worst axis, m."""
         P = self.covariances
         return np.asarray(np.sqrt((P[0, 0] + P[1, 1]) / 2 + np.hypot((P[0, 0] - P[1, 1]) / 2, P[0, 1])))
 
-    def _prune(self) -> None:
+    def _prune(self, hidden: NDArray[np.bool_] | None) -> None:
         config = self.config
         floor = np.where(self.confirmed, config.drop, config.drop_tentative)
-        self._keep((self.existence >= floor) & (self._worst_sigma() <= config.max_sigma))
+        sure = self._worst_sigma() <= config.max_sigma
+        self._keep((self.existence >= floor) & (sure if hidden is None else sure | hidden))
         if config.merge and len(self.ids) > 1:
             i, j = np.triu_indices(len(self.ids), 1)
             spread = self.covariances[..., i] + self.covariances[..., j]
-            spread[[0, 1], [0, 1]] += config.extent**2
+            spread[:2, :2] += self._extent(i)
             apart = linalg.quadratic(spread, self.means[:, i] - self.means[:, j])
             keep = np.ones(len(self.ids), dtype=np.bool_)
             for first, second in zip(i[apart < config.merge], j[apart < config.merge], strict=True):
                 keep[second] &= not keep[first]
             self._keep(keep)
+
+    def _extent(self, at: NDArray[np.intp]) -> Floats:
+        """How far from the tracks `at` (K,) returns of the same target may lie, as covariances (2, 2, K)."""
+        if self.config.hull is None:
+            return np.asarray(self.config.extent**2 * np.eye(2)[..., None])
+        half, beam = (size / 2 for size in self.config.hull)
+        v = self.means[2:4, at]
+        speed = np.hypot(*v)
+        course = np.stack([v, np.stack([-v[1], v[0]])], axis=1) / np.maximum(speed, 1e-6)
+        known = speed >= MOVING
+        along, across = (np.where(known, size**2, half * beam) for size in (half, beam))
+        return np.asarray(
+            along * linalg.outer(course[:, 0], course[:, 0]) + across * linalg.outer(course[:, 1], course[:, 1])
+        )
 
     def _keep(self, chosen: NDArray[np.bool_]) -> None:
         if not chosen.all():

@@ -12,6 +12,7 @@ import numpy as np
 from sensor_clients.events import Parameter
 from sensor_clients.filters import LocalTracker, MeasurementModel, TrackerConfig
 from sensor_clients.filters.measurement import Floats
+from sensor_clients.playback.shadow import Shade, cast
 
 __all__ = ["SECOND", "TUNED", "ClutterMap", "follow", "parameters"]
 
@@ -69,17 +70,27 @@ def follow(
     model: MeasurementModel,
     *,
     beyond: float | None = None,
+    shade: Shade | None = None,
 ) -> None:
     """One scan stamped `time`, ns, of a ship at `own` (2,), m: returns (d, M) as `model` takes them. beyond: the
-    probability of detection farther than `sensor.detection` tells (None: its last)."""
+    probability of detection farther than `sensor.detection` tells (None: its last); shade: what the vessels that the
+    tracker reports hide of one another (None: nothing)."""
     ranges, probabilities = np.array(sensor.detection).T
+    true = time - round(sensor.latency * SECOND)
+    shadows = None
+    if shade is not None:
+        tracker.predict(true)
+        chosen = tracker.reported()
+        shadows = cast(own, tracker.means[:, chosen], tracker.covariances[..., chosen], shade)
 
     def detection(place: Floats) -> Floats:
-        return np.asarray(np.interp(np.hypot(*(place - own[:, None])), ranges, probabilities, right=beyond))
+        p = np.asarray(np.interp(np.hypot(*(place - own[:, None])), ranges, probabilities, right=beyond))
+        return p if shade is None or shadows is None else np.where(shadows.over(place), p * shade.seen, p)
 
     clutter = clutter_map.intensity(returns)
     births = np.full(len(clutter), sensor.births)
-    unused = tracker.step(time - round(sensor.latency * SECOND), returns, model, clutter, births, detection)
+    hidden = None if shadows is None else shadows.unproven
+    unused = tracker.step(true, returns, model, clutter, births, detection, hidden)
     clutter_map.learn(returns, unused)
 
 

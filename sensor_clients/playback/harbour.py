@@ -11,9 +11,14 @@ from schemas import Motion
 from sensor_clients.events import Parameter
 from sensor_clients.filters import LocalTracker, Position, Report, TrackerConfig
 from sensor_clients.filters.measurement import Floats
-from sensor_clients.playback.following import ClutterMap, follow, parameters
+from sensor_clients.playback.following import SECOND, ClutterMap, follow, parameters
+from sensor_clients.playback.hulls import Hulls
+from sensor_clients.playback.shadow import Shade
 
 __all__ = ["LIDAR", "RADAR", "HarbourSensor", "HarbourTracker", "cluster"]
+
+VESSEL = (36.0, 10.0)
+"""Length and beam of the largest vessel reckoned with, m: the larger of the two."""
 
 SOURCES = {
     "period": "median of the data",
@@ -21,6 +26,8 @@ SOURCES = {
     "coverage": "chosen",
     "coverage_detection": "chosen",
     "initiation_delay": "chosen",
+    "shade": "vessels up to 36 by 10 m, as the larger of the two; a radar's beam of 2.6 deg; wake and seen chosen",
+    "resolves": "number of returns of the larger vessel in a scan",
 }
 """Where each number comes from; all others are `following.TUNED`."""
 
@@ -36,7 +43,8 @@ class HarbourSensor:
     returns nearer than this are the own ship's; reach: returns beyond are not looked at; detection: range and
     probability that a vessel is seen, linear between; clutter, births: intensities of false returns (before
     any are learned) and of vessels seen for the first time; map_sigma, map_scans: of the `ClutterMap`;
-    coverage, coverage_detection, initiation_delay: what the info says.
+    coverage, coverage_detection, initiation_delay: what the info says; shade: what vessels hide of one another;
+    resolves: whether one vessel gives several returns, from which its length is learned.
     """
 
     name: str
@@ -59,6 +67,8 @@ class HarbourSensor:
     coverage: float
     coverage_detection: float
     initiation_delay: float
+    shade: Shade
+    resolves: bool
     tracker: TrackerConfig
 
     def parameters(self) -> list[Parameter]:
@@ -71,11 +81,11 @@ LIDAR = HarbourSensor(
     sensor_id=1,
     period=0.5,
     latency=0.7,
-    sigma_range=2.4,
-    sigma_cross=3.0,
+    sigma_range=1.4,
+    sigma_cross=1.8,
     sigma_azimuth=0.0,
     offset=1.5,
-    reference=1.0,
+    reference=1.5,
     cluster=5.0,
     blind=3.5,
     reach=200.0,
@@ -87,6 +97,8 @@ LIDAR = HarbourSensor(
     coverage=75.0,
     coverage_detection=0.8,
     initiation_delay=4.0,
+    shade=Shade(*VESSEL, wake=60.0, width=0.0, seen=0.3),
+    resolves=True,
     tracker=TrackerConfig(
         motion=Motion("cv", 0.05),
         survival=0.99,
@@ -96,9 +108,9 @@ LIDAR = HarbourSensor(
         drop=0.002,
         drop_tentative=0.001,
         max_sigma=12.0,
-        merge=5.0,
-        extent=13.0,
-        min_way=5.0,
+        merge=4.0,
+        hull=VESSEL,
+        min_way=2.0,
         min_speed=0.5,
     ),
 )
@@ -109,15 +121,15 @@ RADAR = HarbourSensor(
     sensor_id=2,
     period=1.68,
     latency=2.2,
-    sigma_range=2.0,
-    sigma_cross=3.0,
-    sigma_azimuth=0.01,
+    sigma_range=1.2,
+    sigma_cross=1.8,
+    sigma_azimuth=0.006,
     offset=-1.0,
-    reference=1.5,
+    reference=2.5,
     cluster=5.0,
     blind=7.0,
-    reach=300.0,
-    detection=((0.0, 0.8), (300.0, 0.8)),
+    reach=500.0,
+    detection=((0.0, 0.8), (500.0, 0.8)),
     clutter=1e-5,
     births=1e-7,
     map_sigma=35.0,
@@ -125,6 +137,8 @@ RADAR = HarbourSensor(
     coverage=250.0,
     coverage_detection=0.8,
     initiation_delay=10.0,
+    shade=Shade(*VESSEL, wake=60.0, width=0.023, seen=0.3),
+    resolves=False,
     tracker=TrackerConfig(
         motion=Motion("cv", 0.08),
         survival=0.99,
@@ -134,9 +148,9 @@ RADAR = HarbourSensor(
         drop=0.1,
         drop_tentative=0.001,
         max_sigma=5.5,
-        merge=1.5,
-        extent=12.0,
-        min_way=5.0,
+        merge=4.0,
+        hull=VESSEL,
+        min_way=2.0,
         min_speed=0.5,
     ),
 )
@@ -159,6 +173,7 @@ class HarbourTracker:
         self.sensor = sensor
         self.tracker = LocalTracker(sensor.tracker)
         self.clutter = ClutterMap(sensor.clutter, sensor.map_sigma, sensor.map_scans)
+        self.hulls = Hulls(sensor.shade.length, sensor.shade.beam / 2 + sensor.sigma_cross)
 
     def step(self, time: int, own: Floats, returns: Floats) -> bool:
         """One scan stamped `time`, ns: own ship's place (2,), returns (2, M) in the same frame, m. Always used."""
@@ -169,13 +184,18 @@ class HarbourTracker:
         returns, sight, distance = returns[:, kept], sight[:, kept], distance[kept]
         if sensor.offset:
             returns = returns + sensor.offset * sight / distance
-        returns = cluster(returns, sensor.cluster)
         model = Position(sensor.sigma_range, sensor.sigma_cross, sensor.sigma_azimuth, (float(own[0]), float(own[1])))
-        follow(self.tracker, self.clutter, sensor, time, own, returns, model, beyond=0.0)
+        if sensor.resolves:
+            self.tracker.predict(time - round(sensor.latency * SECOND))
+            chosen = self.tracker.reported()
+            self.hulls.learn(self.tracker.ids[chosen], self.tracker.means[:, chosen], returns)
+        returns = cluster(returns, sensor.cluster)
+        follow(self.tracker, self.clutter, sensor, time, own, returns, model, beyond=0.0, shade=sensor.shade)
         return True
 
     def report(self, time: int) -> Report:
         """The confirmed tracks, predicted to `time`, ns."""
         report = self.tracker.report(time)
         report.covariances[:, [0, 1], [0, 1]] += self.sensor.reference**2
+        report.covariances[:, :2, :2] += self.hulls.reference(report.ids, report.means.T).transpose(2, 0, 1)
         return report

@@ -285,7 +285,7 @@ def test_live_and_simulated_are_never_fused_unless_told(fuse: bool, expected: in
 
 def test_a_source_that_changes_its_origin_makes_new_tracks() -> None:
     made = centre(("r1",))
-    for second in range(1, 8):
+    for second in range(1, 7):
         give(made, tracks("r1", second, HERE, origin="live" if second < 5 else "exercise", ids=[1]))
         result = step(made, second)
     picture = result.tracks
