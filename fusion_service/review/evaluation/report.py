@@ -14,6 +14,7 @@ import numpy as np
 from fusion_service.errors import ReviewError
 from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.evaluation.assess import Assessment, Evaluation
+from fusion_service.review.evaluation.hull_table import TITLE, hull_table
 from fusion_service.review.evaluation.report_text import CSS, WORDS
 from fusion_service.review.evaluation.results import facts, label, rows_of, rule_of
 from fusion_service.review.evaluation.scoring import Scores
@@ -179,6 +180,8 @@ def _against_truth(rows: Sequence[ScoredCentre]) -> list[str]:
         f"c = {evaluation.c:g} m."
     )
     found = [f'<p class="note">{escape(about)}</p>', _scores(scored)]
+    if hull := hull_table(scored):
+        found += ["<h3>Against the hulls</h3>", _table(hull[0], hull[1:]), f'<p class="note">{escape(TITLE)}.</p>']
     found += [f"<p>Not scored: {escape(name)}: {escape(why)}</p>" for name, why in evaluation.left_out.items()]
     if evaluation.seen.max(initial=0) > 1 and fused:
         text = "On the same pairs of target and time. The best single source is found with the truth, for each target."

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fusion_service.review.evaluation import evaluate
-from fusion_service.review.evaluation.hull_table import hull_lines
+from fusion_service.review.evaluation.hull_table import hull_lines, hull_table
 from fusion_service.review.evaluation.hulls import HullTally, TrueHulls, true_hulls
 from schemas import Ecef, Enu, Truth
 from tests.helpers import missions
@@ -83,5 +83,6 @@ def test_a_mission_is_scored_against_hulls_beside_the_points() -> None:
     assert (other.hull.rmse, other.hull.inside, other.hull.anees) == (0.0, 1.0, 0.0)
     lines = hull_lines(told.sources)
     assert "100 %" in lines[2]
+    assert hull_table(told.sources)[1][:4] == ["radar", str(len(told.times)), "0", "100 %"]
     assert "hull" not in one.more_json()
     assert other.more_json()["hull"]["pairs"] == other.hull.pairs
