@@ -284,6 +284,10 @@ class Registration:
             raise KeyError(name)
         return self._known.posterior.of(self._information.names.index(name))
 
+    def lasts(self, name: str) -> float:
+        """By what the information of a source is divided, since its errors last. ValueError where it is in none."""
+        return float(self._lasting.ratio[self._information.names.index(name)])
+
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns."""
         self._time = min(self._time, time)

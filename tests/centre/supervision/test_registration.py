@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import schemas
+from benchmarks.offset_sources import Offset, World
 from fusion_service.centre import FusionCentre, StepResult
-from tests.helpers.offset_sources import Offset, World
 
 RULED: dict[str, Any] = {"memory": "restart", "rule": "ci"}
 CORRECT: dict[str, Any] = {"registration": "correct", **RULED}

@@ -25,7 +25,8 @@ START = 1_780_000_000 * SECOND
 class Offset:
     """A source: where it stands, m; its errors (s, m, m, rad, m, 1; as `bias` has them); sigma of places and
     velocities; lasting: correlation of successive errors of a track; tracker: its tracks are those of Kalman filters,
-    of detections each second with the sigma of places; drift of its clock, s/s."""
+    of detections each second with the sigma of places; drift of its clock, s/s; claims: what it
+    says of its sigmas, as a share of them."""
 
     place: tuple[float, float] = (0.0, 0.0)
     clock: float = 0.0
@@ -39,6 +40,7 @@ class Offset:
     drift: float = 0.0
     polar: bool = False
     tracker: bool = False
+    claims: float = 1.0
 
     def says(self, states: Floats) -> Floats:
         """What it says of true states (T, 4), written down anew from the geometry: polar coordinates about it."""
@@ -108,7 +110,7 @@ class World:
             self.errors[name] = a * self.errors[name] + np.sqrt(1 - a * a) * self._error(one)
             clock = one.clock + one.drift * self.second
             says = one.says(self.truth(self.second - clock)) + self.errors[name]
-            spread = np.diag(np.repeat(one.sigma, 2) ** 2)
+            spread = np.diag(np.repeat(one.sigma, 2) ** 2) * one.claims**2
             if one.tracker:
                 says, spread = self._tracked(name, says)
             some = self.seen[name]
