@@ -13,7 +13,7 @@ which moves like a target and goes round with the vessel's bearing.
 track follows; those behind, within Kelvin's angle of asin 1/3 to either side, may be of its wake.
 
 In all of these nothing begins: a track counts as new when it comes out into the open. What was tracked in the open
-before goes on.
+before goes on, and so does an echo that was found before its vessel.
 """
 
 from __future__ import annotations

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -83,6 +85,35 @@ def test_a_duplicate_ends() -> None:
     assert tracker.ids.tolist() == [1, 2, 3]
     step(tracker, 1, np.zeros((2, 0)))
     assert tracker.ids.tolist() == [1, 3], "the elder stays"
+
+
+def test_two_are_one_along_a_hull_and_two_abeam() -> None:
+    """Moving east at 10 m/s, 25 m apart: in line they are bow and stern of 36 m, abeam two boats."""
+    config = TrackerConfig(*(Motion("cv", 0.1), 1.0, 10.0), merge=4.0, hull=(36.0, 10.0), drop_tentative=0.0)
+    for apart, count in (([25.0, 0.0], 1), ([0.0, 25.0], 2)):
+        tracker = LocalTracker(config)
+        for second in range(6):
+            place = np.array([[10.0 * second], [0.0]])
+            step(tracker, second, np.concatenate([place, place + np.array(apart)[:, None]], axis=1))
+        assert (tracker.existence > 0.5).sum() == count
+
+
+def test_what_is_hidden_proves_nothing_until_it_comes_out() -> None:
+    """Seen all along, hidden for 20 s: reported soon after, and not for the way that it made before."""
+    config = replace(CONFIG, min_way=20.0)
+    tracker, first = LocalTracker(config), 0
+    for second in range(40):
+        place = np.array([[10.0 * second], [0.0]])
+        area = np.full(1, 1 / (2 * SIDE) ** 2)
+        tracker.step(second * SECOND, place, MODEL, CLUTTER * area, area, inside, lambda at: at[0] < 200.0)
+        if not first and len(tracker.report().ids):
+            first = second
+    assert 22 <= first <= 26
+    for second in range(40, 50):  # and goes on where it is hidden again
+        place = np.array([[10.0 * second], [0.0]])
+        area = np.full(1, 1 / (2 * SIDE) ** 2)
+        tracker.step(second * SECOND, place, MODEL, CLUTTER * area, area, inside, lambda at: at[0] > 0.0)
+        assert tracker.report().ids.tolist() == [1]
 
 
 def test_ids_are_never_used_twice() -> None:
