@@ -100,7 +100,7 @@ def source_event(event: Mapping[str, Any]) -> tuple[bool, str] | None:
         return state not in NO_ALARM, text
     if kind == "registration":
         taken = "its bias is taken off" if event.get("applied") is True else "its bias is not taken off"
-        return bool(event.get("applied")), f"{taken}{f': {why}' if why else ''}"
+        return bool(event.get("applied")), why or taken
     if kind in ("alarm", "alarm_over") and _text(event.get("source")):
         over = "no more: " if kind == "alarm_over" else "alarm: "
         what = _text(event.get("what"))

@@ -17,7 +17,7 @@ REASONS = {
     "motion": "nobody declares how its tracks move",
     "feedback": "its tracker is fed with fused tracks",
     "covariance_floor": "a covariance_floor is set for it",
-    "registration": "it states an error common to all its tracks",
+    "registration": "all its tracks have an error in common, which is stated, or remains of one taken off",
     "space": "its tracks do not have the components of the picture",
     "innovations": "its innovations are not those that its covariances and its motion say",
     "dependent": "what it adds agrees with the picture as if it came from it: is its tracker fed with fused tracks?",

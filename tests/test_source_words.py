@@ -50,7 +50,7 @@ def test_health_says_what_is_amiss_and_nothing_of_a_sound_source() -> None:
     [
         ({"kind": "supervision", "state": "out", "was": "watch", "why": "w"}, (True, "out, was watch: w")),
         ({"kind": "supervision", "state": "trusted", "was": "out", "why": ""}, (False, "trusted, was out")),
-        ({"kind": "registration", "applied": True, "why": "clock"}, (True, "its bias is taken off: clock")),
+        ({"kind": "registration", "applied": True, "why": "clock"}, (True, "clock")),
         ({"kind": "registration", "applied": False, "why": ""}, (False, "its bias is not taken off")),
         ({"kind": "alarm", "what": "jump", "source": "a", "metres": 3}, (True, "alarm: jump (metres 3)")),
         ({"kind": "alarm_over", "what": "jump", "source": "a", "why": "w"}, (False, "no more: jump: w")),

@@ -67,9 +67,9 @@ def blueprint(
         charts("influence", "Influence (weights per source)", 1.05),
     ]
     watched = [
-        _chart(rr, rrb, "/consistency", "Sources beside each other (1 is right)", 3.0),
-        _chart(rr, rrb, "/clock", "Clock offsets (s, two sigma)"),
-        rrb.Spatial2DView(origin="/registration", name="Registration (m, two sigma)", background=BACKGROUND),
+        _chart(rr, rrb, "/consistency", "Sources (1 is right)", 3.0),
+        _chart(rr, rrb, "/clock", "Clocks (s)"),
+        rrb.Spatial2DView(origin="/registration", name="Registration (m)", background=BACKGROUND),
     ]
     pages = [rrb.TextDocumentView(origin=entity("health", one), name=f"Health: {one}") for one in centres]
     told = [_log(rrb, "/log", "Status log"), *(pages or [rrb.TextDocumentView(origin="/health", name="Health")])]
@@ -78,8 +78,8 @@ def blueprint(
         rrb.Tabs(*pictures, active_tab=0),
         [
             rrb.Tabs(*upper, active_tab=0),
-            rrb.Tabs(*lower, *(watched if supervised else []), active_tab=0),
-            rrb.Tabs(*told, active_tab=0),
+            rrb.Tabs(*lower, active_tab=0),
+            rrb.Tabs(*told, *(watched if supervised else []), active_tab=0),
         ],
     )
 
