@@ -147,7 +147,7 @@ def named_after(kind: str, sources: int, targets: int, factor: float, seeds: ran
         found.append(when)
     tenth, middle, ninth = np.quantile(found, [0.1, 0.5, 0.9], method="nearest")
     print(
-        f"{kind:<9} {sources:>2} x {targets:<3} sigma x {factor:<6.3g} named after {middle:.0f} scans of it ({tenth:.0f} to "
+        f"{kind:<9} {sources:>2} x {targets:<3} sigma x {factor:<6.3g} named after {middle:.0f} scans ({tenth:.0f} to "
         f"{ninth:.0f}; {int(np.isinf(found).sum())} of {len(found)} not in {most} s), another one before: {others}"
     )
 

@@ -178,6 +178,26 @@ def test_cu_is_the_smallest_bound(N: int, n: int, criterion: str) -> None:
         assert size(fused.covariance) <= found.fun + 1e-6 + 10 * n * max(0.0, -slack)
 
 
+@pytest.mark.parametrize("criterion", ["det", "trace"])
+@pytest.mark.parametrize("small", [1e-3, 1e-6, 1e-9])
+def test_union_holds_beside_a_source_that_claims_far_too_much(criterion: str, small: float) -> None:
+    """It is found, above all, and in the limit what follows without the small covariance: for that, U_3 = d d' alone,
+    the least P above U_1 and U_2 with d' P^-1 d <= 1."""
+    rng = np.random.default_rng(SEED)
+    x = rng.normal(size=(40, 3, 4)) * np.array([30.0, 30.0, 2.0, 2.0])
+    P = np.tile(np.diag([900.0, 900.0, 4.0, 4.0]), (40, 3, 1, 1))
+    P[:, 2] *= small
+    fused = fuse("cu", x, P, criterion=criterion)
+    scale = np.diag(1.0 / np.array([30.0, 30.0, 2.0, 2.0]))
+    for one, mean, found in zip(x, P, fused.covariance, strict=True):
+        for u in adjusted(one, mean, np.full(3, 1 / 3)):
+            assert np.linalg.eigvalsh(scale @ (found - u) @ scale).min() >= -1e-9
+    P[:, 2] *= 1e-3
+    limit = fuse("cu", x, P, criterion=criterion)
+    change = np.abs(scale @ (limit.covariance - fused.covariance) @ scale).max(axis=(1, 2))
+    assert (change <= 100 * small + 1e-4).all(), change.max()
+
+
 def test_intersection_and_union_of_ellipsoids_add_up_however_hard() -> None:
     """T min(r, 1) T' + T max(r, 1) T' = P_1 + P_2, and their determinants multiply to |P_1| |P_2|; or refused."""
     rng = np.random.default_rng(SEED)
