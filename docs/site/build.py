@@ -28,7 +28,18 @@ ELSEWHERE = {
 """Pages that are not below docs/: path in the repository, name in the site."""
 SECTIONS = {
     "Use it": [
-        *("tutorial", "operating", "judgement", "tracklets", "motion", "rules", "mixtures", "partial", "review"),
+        *(
+            "tutorial",
+            "operating",
+            "judgement",
+            "registration",
+            "tracklets",
+            "motion",
+            "rules",
+            "mixtures",
+            "partial",
+            "review",
+        ),
         *("docker", "wire"),
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "rules-speed"],
