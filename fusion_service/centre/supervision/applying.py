@@ -27,6 +27,8 @@ MATTERS, HARDLY = 0.04, 0.01
 """Mean squares of the error beside those of the tracks, to be found and to be kept."""
 LOOSE = 0.1
 """Mean square of what stays uncertain beside those of the tracks, beyond which it is not neglected."""
+NOTHING = 0.99
+"""Of what is supposed beforehand: an error that is known no better is not taken off, and nothing is added for it."""
 MOVED = 25.0
 """Square of a change in its own sigmas that is told."""
 
@@ -79,7 +81,8 @@ def decide(before: Applied, told: Told, effect: Floats, errors: float, corrects:
     found = (before.found and holds) or looks >= IN_A_ROW
     on = found and corrects
     loose = bool(effect[1] > (LOOSE / 2 if before.loose else LOOSE))
-    value, covariance = (told.mean, told.covariance) if on else (np.zeros(P), np.zeros((P, P)))
+    known = (told.spread < NOTHING * told.sigma) & on
+    value, covariance = np.where(known, told.mean, 0.0), np.where(np.outer(known, known), told.covariance, 0.0)
     after = replace(before, found=found, on=on, loose=loose, looks=looks, value=value, covariance=covariance)
     sigma = np.where(before.sigma > 0, before.sigma, np.inf)
     moved = found and bool((((told.mean - before.told) / sigma) ** 2 > MOVED).any())

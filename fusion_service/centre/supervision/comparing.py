@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.sources import Tracks
 from fusion_service.centre.supervision.bias import design
 from fusion_service.centre.supervision.estimate import Group, inverse_2x2
 from fusion_service.centre.supervision.lasting import Lasting
@@ -21,6 +22,10 @@ MOST_TARGETS = 48
 """Shared targets that are looked at in a step; of more those whose turn it is, for some time in a row."""
 TURN = 64
 """Steps."""
+LARGEST = 1e8
+"""m, m/s, m2."""
+FINEST = 1e-4
+"""m2: no place is taken for better known."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -64,7 +69,7 @@ def chosen_rows(rows: Rows, label: NDArray[np.uint64], now: Picture, whose: Ints
     if not len(mine) or not len(now.id):
         return mine[:0]
     at = np.minimum(now.find(label[mine]), len(now.id) - 1)
-    mine = mine[(now.id[at] == label[mine]) & (now.time[at] >= 0)]
+    mine = mine[(now.id[at] == label[mine]) & (now.time[at] >= 0) & _plausible(rows.tracks, mine) & _plausible(now, at)]
     target, group, count = np.unique(label[mine], return_inverse=True, return_counts=True)
     new = np.bincount(group[rows.fresh[mine]], minlength=len(target)) > 0
     some = np.flatnonzero((count > 1) & new)
@@ -84,6 +89,13 @@ def chosen_rows(rows: Rows, label: NDArray[np.uint64], now: Picture, whose: Ints
     mine = mine[~double]
     _, group, count = np.unique(label[mine], return_inverse=True, return_counts=True)
     return np.asarray(mine[count[group] > 1])
+
+
+def _plausible(tracks: Tracks | Picture, at: Ints) -> Bools:
+    """Which states (K,) are near enough, slow enough and known well enough to be compared."""
+    state = np.abs(tracks.mean[:, at]).max(axis=0, initial=0.0) < LARGEST
+    variance = tracks.covariance[0, 0, at] + tracks.covariance[1, 1, at]
+    return np.asarray(state & (variance < LARGEST))
 
 
 def compared(
@@ -107,6 +119,7 @@ def compared(
     own = rows.tracks.covariance[np.ix_(xy, xy)][..., row]
     if how.common.any() or how.shift.any():
         own = _own(own, H, how.common[source], how.shift[..., source])
+    own = own + FINEST * np.eye(2)[:, :, None]
     made = Group(source, group, start, H, z, inverse_2x2(own))
     return Compared(row, made, own, place, velocity)
 

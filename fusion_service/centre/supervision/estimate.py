@@ -60,6 +60,11 @@ class Posterior:
         s, p = self.mean.shape
         return np.diagonal(self.covariance.reshape(s * p, s * p)).reshape(s, p)
 
+    @property
+    def sound(self) -> bool:
+        """Whether it is finite, and no variance is negative."""
+        return bool(np.isfinite(self.covariance).all() and np.isfinite(self.mean).all() and (self.variance >= 0).all())
+
 
 class Information:
     """What shared targets have told of the errors of the sources `names`. shared (S, S): how many targets two of them
@@ -149,7 +154,7 @@ class Information:
         scale = sigma.ravel()[free]
         flat, sums = self.matrix.reshape(sigma.size, sigma.size), gauge.reshape(len(gauge), sigma.size)[:, free] / TIGHT
         A = np.eye(len(free)) + flat[np.ix_(free, free)] * scale[:, None] * scale + sums.T @ sums
-        inverse = np.linalg.inv(0.5 * (A + A.T)) if len(free) else np.zeros((0, 0))
+        inverse = _inverse(0.5 * (A + A.T))
         inverse = 0.5 * (inverse + inverse.T) * scale[:, None] * scale
         mean, covariance = np.zeros(sigma.size), np.zeros((sigma.size, sigma.size))
         mean[free] = inverse @ self.vector.ravel()[free]
@@ -171,6 +176,14 @@ class Information:
             for part, one in zip(parts, like, strict=True)
         )
         return made
+
+
+def _inverse(A: Floats) -> Floats:
+    """A^-1, NaN where there is none."""
+    try:
+        return np.asarray(np.linalg.inv(A)) if len(A) else A
+    except np.linalg.LinAlgError:
+        return np.full_like(A, np.nan)
 
 
 def inverse_2x2(A: Floats) -> Floats:

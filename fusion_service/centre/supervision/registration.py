@@ -206,6 +206,9 @@ class Registration:
             before = self._known.posterior
             self._weights = gauge_weights(sigma, label, before.mean, before.variance)
         posterior = info.posterior(sigma, gauge(sigma, label, reference, self._weights))
+        if not posterior.sound:  # what no data can do, and absurd ones might
+            self._information, self._weights = Information(names), np.ones(sigma.shape)
+            posterior, label = self._information.posterior(sigma, np.zeros((0, *sigma.shape))), np.arange(len(names))
         self._known = _Known(sigma, label, reference, posterior, sites)
 
     def _standing(self, name: str) -> tuple[Floats, Floats]:

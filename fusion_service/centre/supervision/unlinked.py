@@ -44,6 +44,8 @@ class Unlinked:
         self._turn += 1
         one, other = pairs[self._turn % len(pairs)]
         a, b = (np.flatnonzero((rows.source == k) & (rows.tracks.link != NO_TRACK)) for k in (one, other))
+        if rows.tracks.origin[a[0]] != rows.tracks.origin[b[0]]:
+            return
         both = np.hypot(sigma[whose[one]], sigma[whose[other]])
         i, j = match(_plane(rows, a, space), _plane(rows, b, space), sites[:, whose[other]], both)
         self._count(rows.tracks.link, a, b, set(zip(a[i].tolist(), b[j].tolist(), strict=True)), step)

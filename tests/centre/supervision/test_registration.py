@@ -177,3 +177,22 @@ def test_honest_sources_are_left_alone() -> None:
     world = World({name: Offset(lasting=0.7) for name in "abcd"}, **CORRECT)
     told = [event for _ in range(40) for event in world.step().log.events if event["kind"] == "registration"]
     assert told == []
+
+
+def test_absurd_numbers_raise_nothing_and_leave_the_rest_as_it_is() -> None:
+    world = World({"a": Offset(), "b": Offset(clock=0.2), "c": Offset()}, **CORRECT, **A)
+    world.run(6)
+    before = bias(world.step(), "b")["clock"]
+    for second, (size, variance) in enumerate([(1e12, 1.0), (1e200, 1e300), (0.0, 1e-200), (1.0, 1e200)], start=100):
+        said = schemas.LocalTracks(
+            source="c", epoch=1, seq=second, sent=0, time=world.centre.time + 10**8, complete=True,
+            space=("x", "y", "vx", "vy"), frame=world.centre._intake.frame or schemas.Enu(0.0, 0.0),
+            ids=np.arange(1, 26, dtype=np.uint64), means=np.full((25, 4), size),
+            covariances=np.tile(variance * np.eye(4), (25, 1, 1)),
+        )  # fmt: skip
+        world.centre.handle(said, world.centre.time + 10**9)
+        after = bias(world.step(), "b")["clock"]
+        assert math.isfinite(after["value"])
+        assert math.isfinite(after["sigma"])
+    after = bias(world.run(5), "b")["clock"]
+    assert abs(after["value"] - 0.2) < 5 * before["sigma"]
