@@ -20,9 +20,9 @@ from scipy.stats import chi2
 from fusion_service import linalg
 from fusion_service.arrays import Floats
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import empty_tracks
 from fusion_service.centre.supervision.honesty import Honesty
 from fusion_service.centre.supervision.shared import shared_pairs
+from fusion_service.centre.tracks import empty_tracks
 from fusion_service.motion import transition
 from schemas import Motion
 from sensor_clients.filters.kalman import Estimate, predict, update

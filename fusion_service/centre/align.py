@@ -18,9 +18,10 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import LINKS, Columns, Source, Tracks, join_tracks, no_parts
+from fusion_service.centre.sources import Source
 from fusion_service.centre.standing import turned
 from fusion_service.centre.stated_registration import shift_of
+from fusion_service.centre.tracks import LINKS, Columns, Tracks, join_tracks, no_parts
 from fusion_service.centre.treatment import treated
 from fusion_service.densities import Mixtures
 from schemas import Entry, Frame, Motion

@@ -30,7 +30,7 @@ from fusion_service.arrays import Bools, Ints, from_bytes, to_bytes
 from fusion_service.centre.extents import BLOB, shaped, widened
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import EXTENT_ROWS
+from fusion_service.centre.tracks import EXTENT_ROWS
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import chi2_quantile
 from schemas import Ecef, Frame

@@ -18,7 +18,8 @@ from fusion_service.centre.intervals import NOTHING_REMEMBERED, Remembered
 from fusion_service.centre.lifecycle import Picture, empty_picture
 from fusion_service.centre.places import Place
 from fusion_service.centre.restoring import fit_config
-from fusion_service.centre.sources import Source, Tracks, empty_tracks, padded
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Tracks, empty_tracks, padded
 from fusion_service.centre.words import Lexicon, Words
 from fusion_service.errors import FusionError
 from fusion_service.order import Order

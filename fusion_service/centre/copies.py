@@ -32,7 +32,7 @@ from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.partial import apart
 from fusion_service.centre.rows import NO_TRACK, Rows
-from fusion_service.centre.sources import set_links
+from fusion_service.centre.tracks import set_links
 from fusion_service.centre.words import NONE
 from fusion_service.config import CentreConfig
 

@@ -8,7 +8,8 @@ import numpy as np
 
 from fusion_service.centre.intervals import Pace
 from fusion_service.centre.places import Place
-from fusion_service.centre.sources import Source, Tracks
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.coverage import at_platform
 from fusion_service.densities import Mixtures

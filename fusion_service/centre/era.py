@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.centre.sources import Columns, Source
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Columns
 from fusion_service.config import CentreConfig
 from schemas import LocalIntensity, LocalTracks, SensorInfo
 

@@ -22,7 +22,7 @@ from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.extents import BLOB
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import FUSED_ROWS
+from fusion_service.centre.tracks import FUSED_ROWS
 from schemas import MAX_EXTENT, SHAPES
 
 __all__ = ["extent_columns", "fused_extents"]

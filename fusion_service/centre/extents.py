@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Bools, Floats
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import EXTENT_ROWS, Tracks
+from fusion_service.centre.tracks import EXTENT_ROWS, Tracks
 from fusion_service.geodesy import axis_turn, level_axes
 from schemas import REFERENCES, SHAPES, Ecef, Frame, LocalTracks
 

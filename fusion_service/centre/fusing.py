@@ -25,7 +25,7 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import NO_TRACK, Rows
-from fusion_service.centre.sources import no_parts, padded
+from fusion_service.centre.tracks import no_parts, padded
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures, reduce_mixtures
 from fusion_service.rules import MIXTURE_RULES, RULES, Fused, fuse_last

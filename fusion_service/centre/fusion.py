@@ -22,8 +22,8 @@ from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.memory import Memory
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import NO_TRACK, Rows
-from fusion_service.centre.sources import relinked
 from fusion_service.centre.supervision import Supervisor
+from fusion_service.centre.tracks import relinked
 from fusion_service.config import CentreConfig
 
 __all__ = ["FusionCentre"]

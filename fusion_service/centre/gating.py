@@ -21,7 +21,7 @@ from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
-from fusion_service.centre.sources import set_links
+from fusion_service.centre.tracks import set_links
 from schemas import messages
 
 __all__ = ["Judgement", "Settings", "judge", "manoeuvred"]

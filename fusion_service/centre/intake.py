@@ -30,7 +30,8 @@ from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.pictures import as_scan, is_own, is_picture_of, source_of
 from fusion_service.centre.scans import Scan, as_tracks, fits, is_sound, message_tracks, size_of
-from fusion_service.centre.sources import Source, Tracks, empty_tracks
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Tracks, empty_tracks
 from fusion_service.centre.treatment import AS_IT_IS, Treatment
 from fusion_service.centre.words import Lexicon, Words
 from fusion_service.config import CentreConfig, SourceConfig

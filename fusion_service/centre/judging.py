@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre.sources import Tracks
+from fusion_service.centre.tracks import Tracks
 from fusion_service.order import ABOUT, STATES, WHAT, LocalId, Order
 from schemas import check_source
 

@@ -24,7 +24,7 @@ from fusion_service.centre.association import by_size
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lineage import ANYONE, Codes, Kin, overlapping
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import Tracks
+from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig
 from fusion_service.rules import fuse_last
 

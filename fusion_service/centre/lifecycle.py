@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.centre.lineage import NOBODY
-from fusion_service.centre.sources import as_mixtures, join_tracks, no_parts
+from fusion_service.centre.tracks import as_mixtures, join_tracks, no_parts
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
@@ -34,7 +34,7 @@ WAYS = ("", "tracklet", "bar-shalom-campo derived", "bci derived", "bci declared
 class Picture:
     """G global tracks sorted by id: mean (n, G), covariance (n, n, G), the rest (G,).
 
-    log_weight (C, G), part_mean (n, C, G), part_covariance (n, n, C, G): components as in `sources.Tracks`.
+    log_weight (C, G), part_mean (n, C, G), part_covariance (n, n, C, G): components as in `tracks.Tracks`.
     id u64; status u8; time i64 of the density (-1: none yet); updated i64 of the last measurement in it;
     seen i64 time of the newest local track in it; born i64 of its first step; due i64 when its next report is
     overdue (of one that was dropped: so long ago that its time is up with the next report); interval i64 between

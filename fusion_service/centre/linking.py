@@ -30,7 +30,7 @@ from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.rows import NO_TRACK, Rows
-from fusion_service.centre.sources import set_links
+from fusion_service.centre.tracks import set_links
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import assign_near
 from schemas import Entry, messages

@@ -15,7 +15,7 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.rows import NO_TRACK, Rows
-from fusion_service.centre.sources import set_links
+from fusion_service.centre.tracks import set_links
 from fusion_service.centre.words import NONE, Codes
 from schemas import messages
 

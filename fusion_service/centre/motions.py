@@ -17,7 +17,7 @@ from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.align import predict_tracks
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
-from fusion_service.centre.sources import join_tracks, no_parts
+from fusion_service.centre.tracks import join_tracks, no_parts
 from fusion_service.motion import predict
 from schemas import Motion
 

@@ -15,7 +15,7 @@ from fusion_service.centre.judging import View, find_local, judge, linked_to
 from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.partial import Unknown, brought
 from fusion_service.centre.rows import NO_TRACK
-from fusion_service.centre.sources import relinked
+from fusion_service.centre.tracks import relinked
 from fusion_service.order import LocalId, Order, order_event
 
 __all__ = ["Obeyed", "heirs", "obey", "view_of"]

@@ -19,7 +19,8 @@ from fusion_service.centre.extents import turned
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown, brought, transformed
 from fusion_service.centre.rows import NO_TRACK
-from fusion_service.centre.sources import Source, Tracks, empty_tracks
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Tracks, empty_tracks
 from fusion_service.config import CentreConfig
 from fusion_service.geodesy import FrameError
 from schemas import Frame, Height

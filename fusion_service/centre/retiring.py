@@ -6,7 +6,8 @@ import numpy as np
 
 from fusion_service.centre import notes
 from fusion_service.centre.intervals import Remembered, remember, silence
-from fusion_service.centre.sources import Source, Tracks
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig, SourceConfig
 
 __all__ = ["leave_out", "retire"]

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.centre.lineage import Kin
-from fusion_service.centre.sources import Tracks
+from fusion_service.centre.tracks import Tracks
 
 __all__ = ["NO_TRACK", "Rows"]
 

@@ -14,7 +14,7 @@ from fusion_service.arrays import Floats
 from fusion_service.centre.extents import message_extents
 from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.partial import transformed
-from fusion_service.centre.sources import Tracks, no_parts, unlinked
+from fusion_service.centre.tracks import Tracks, no_parts, unlinked
 from fusion_service.centre.words import Lexicon
 from fusion_service.densities import Mixtures, reduce_mixtures
 from schemas import FAULTS, ORIGINS, Frame, GlobalTracks, Height, LocalIntensity, LocalTracks, Message, SensorInfo

@@ -20,7 +20,8 @@ import numpy as np
 from fusion_service.arrays import Floats
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.places import Place, before
-from fusion_service.centre.sources import Source, Tracks
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Tracks
 from fusion_service.densities import Mixtures
 from fusion_service.geodesy import FrameError, ecef_to_geodetic, transform
 from schemas import Ecef, Frame, Platform

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 
 from fusion_service.arrays import Floats
-from fusion_service.centre.sources import Tracks
+from fusion_service.centre.tracks import Tracks
 from fusion_service.densities import Mixtures
 
 __all__ = ["AS_IT_IS", "PLACES", "Correction", "Treatment", "treated"]

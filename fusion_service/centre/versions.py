@@ -18,7 +18,7 @@ from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.align import predict_tracks
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import Pair, Tracks, join_tracks
+from fusion_service.centre.tracks import Pair, Tracks, join_tracks
 from fusion_service.centre.treatment import Treatment
 from schemas import Motion
 

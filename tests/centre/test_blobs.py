@@ -13,7 +13,7 @@ from fusion_service.centre import FusionCentre
 from fusion_service.centre.blobs import HOLD, Blobs
 from fusion_service.centre.lifecycle import newborn
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import empty_tracks, unlinked
+from fusion_service.centre.tracks import empty_tracks, unlinked
 from schemas import STATUSES
 from tests.centre.passing import CAMERA, LIDAR, MERGED, boats, passing
 from tests.centre.worlds import START, centre, give, info, step, tracks

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from fusion_service.centre.consensus import consensus
 from fusion_service.centre.gating import _without
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import empty_tracks
+from fusion_service.centre.tracks import empty_tracks
 from tests.helpers.strategies import Array, sources
 
 

@@ -15,7 +15,7 @@ from fusion_service.centre.extent_fusion import fused_extents
 from fusion_service.centre.extents import message_extents, shaped, widened
 from fusion_service.centre.lifecycle import empty_picture, newborn
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import empty_tracks, unlinked
+from fusion_service.centre.tracks import empty_tracks, unlinked
 from fusion_service.geodesy import axis_turn, ecef_to_geodetic, enu_to_geodetic, geodetic_to_ecef, geodetic_to_enu
 from tests.centre.worlds import FRAME, SPACE, centre, give, step, tracks
 

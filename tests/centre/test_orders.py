@@ -16,7 +16,7 @@ from fusion_service.centre.constraints import constraints
 from fusion_service.centre.judging import Standing
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import empty_tracks
+from fusion_service.centre.tracks import empty_tracks
 from fusion_service.order import order_event
 from schemas.messages import APART, BROKEN, IDENTITY_ORDERED
 from tests.centre.worlds import START, centre, give, info, moved, step, tracks, truth

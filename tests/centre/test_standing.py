@@ -12,8 +12,9 @@ import pytest
 import schemas
 from fusion_service.centre import FusionCentre
 from fusion_service.centre.places import Place, before, followed
-from fusion_service.centre.sources import Source, empty_tracks
+from fusion_service.centre.sources import Source
 from fusion_service.centre.standing import heading_sigma_of, place_of, turned
+from fusion_service.centre.tracks import empty_tracks
 from fusion_service.coverage import covers
 from fusion_service.geodesy import transform
 from fusion_service.metrics import nees_bounds

@@ -10,7 +10,7 @@ import numpy as np
 
 from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import empty_tracks, unlinked
+from fusion_service.centre.tracks import empty_tracks, unlinked
 
 SECOND = 10**9
 SPACE = ("x", "vx", "y", "vy")

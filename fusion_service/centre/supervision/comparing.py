@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
-from fusion_service.centre.sources import Tracks
 from fusion_service.centre.supervision.bias import design
 from fusion_service.centre.supervision.estimate import Group, inverse_2x2
 from fusion_service.centre.supervision.lasting import Lasting
+from fusion_service.centre.tracks import Tracks
 
 __all__ = ["MOST_TARGETS", "Compared", "Treated", "chosen_rows", "compared", "labels"]
 

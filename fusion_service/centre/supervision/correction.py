@@ -17,8 +17,8 @@ import numpy as np
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats
-from fusion_service.centre.sources import Tracks
 from fusion_service.centre.supervision.bias import CLOCK, HEADING, PARAMETERS, RANGE, SCALE, X, Y, design
+from fusion_service.centre.tracks import Tracks
 from fusion_service.densities import Mixtures
 
 __all__ = ["Bias"]

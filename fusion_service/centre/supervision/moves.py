@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Bools, Floats
 from fusion_service.centre.partial import Unknown
-from fusion_service.centre.sources import Source, Tracks
+from fusion_service.centre.sources import Source
+from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig
 from schemas import Frame
 

@@ -10,13 +10,13 @@ import pytest
 from numpy.typing import NDArray
 
 from benchmarks.offset_sources import SPACE, Offset
-from fusion_service.centre.sources import empty_tracks
 from fusion_service.centre.supervision.bias import CLOCK, PARAMETERS, design
 from fusion_service.centre.supervision.correction import Bias
 from fusion_service.centre.supervision.estimate import Group, Information
 from fusion_service.centre.supervision.gauge import connected, gauge, gauge_weights, gauge_words
 from fusion_service.centre.supervision.lasting import Lasting
 from fusion_service.centre.supervision.matching import Tracks2, match
+from fusion_service.centre.tracks import empty_tracks
 
 Floats = NDArray[np.float64]
 P = len(PARAMETERS)

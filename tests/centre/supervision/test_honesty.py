@@ -15,12 +15,12 @@ import schemas
 from fusion_service.arrays import Floats
 from fusion_service.centre import FusionCentre, Order, StepResult
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.sources import empty_tracks
 from fusion_service.centre.supervision.hat import Pairs, decidable, solved
 from fusion_service.centre.supervision.honesty import Honesty, Opinion
 from fusion_service.centre.supervision.scale import BINS, binned, high_bound, low_bound, robust_scale, sigmas
 from fusion_service.centre.supervision.shared import shared_pairs
 from fusion_service.centre.supervision.states import States
+from fusion_service.centre.tracks import empty_tracks
 from tests.centre.worlds import SPACE, START, centre, give, info, step, tracks
 
 SEED = 1311
