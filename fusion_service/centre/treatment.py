@@ -11,7 +11,7 @@ from fusion_service.arrays import Floats
 from fusion_service.centre.sources import Tracks
 from fusion_service.densities import Mixtures
 
-__all__ = ["AS_IT_IS", "Correction", "Treatment", "treated"]
+__all__ = ["AS_IT_IS", "PLACES", "Correction", "Treatment", "treated"]
 
 PLACES = ("x", "y", "z")
 
