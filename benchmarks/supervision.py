@@ -29,7 +29,7 @@ from sensor_clients.filters.kalman import Estimate, predict, update
 
 SPACE = ("x", "y", "vx", "vy")
 H = np.eye(4)[:2]
-RATES = (0.001, 1.0)
+RATES = (0.001, 1.0, 100.0)
 
 
 class World:

@@ -41,8 +41,6 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     starts: list[NDArray[np.bool_]] = []
     interval: list[NDArray[np.int64]] = []
     lost: list[NDArray[np.bool_]] = []
-    out: list[NDArray[np.bool_]] = []
-    union: list[NDArray[np.bool_]] = []
     gates: list[NDArray[np.float64]] = []
     kept: dict[str, int] = {}
     room = MAX_TOTAL // max(len(intake.sources), 1)
@@ -64,8 +62,6 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         index.append(np.full(count, number, dtype=np.intp))
         epochs.append(np.full(count, max(source.epoch, 0), dtype=np.uint64))  # -1: nothing was heard of it yet
         starts.append(np.full(count, said.may_start and not treatment.out, dtype=np.bool_))
-        out.append(np.full(count, treatment.out, dtype=np.bool_))
-        union.append(np.full(count, treatment.union, dtype=np.bool_))
         interval.append(table.interval[sound])
         lost.append(np.full(count, source.alive is False, dtype=np.bool_))
         gate = config.gate if said.gate is None else said.gate
@@ -74,6 +70,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         parts.append(intake.nothing())
     tracks = join_tracks(parts)
     whose = _joined(index, np.intp)
+    treatments = [intake.treatment(name) for name in intake.names()]
     kin = kinship.of_rows(intake, tracks, whose)
     return Rows(
         source=whose,
@@ -86,8 +83,8 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         fresh=tracks.updated > tracks.judged,
         kept=kept,
         kin=kin,
-        out=_joined(out, np.bool_),
-        union=_joined(union, np.bool_),
+        out=np.array([one.out for one in treatments], dtype=np.bool_)[whose],
+        union=np.array([one.union for one in treatments], dtype=np.bool_)[whose],
     )
 
 
