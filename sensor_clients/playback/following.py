@@ -103,4 +103,7 @@ def parameters(sensor: Any, config: TrackerConfig, sources: Mapping[str, str]) -
     ]
     rows.append(Parameter(f"{sensor.name} tracker motion", f"{config.motion.kind}, q = {config.motion.q:g}", TUNED))
     names = [field.name for field in fields(config) if field.name not in ("motion", "cubature")]
-    return rows + [Parameter(f"{sensor.name} tracker {name}", str(getattr(config, name)), TUNED) for name in names]
+    return rows + [
+        Parameter(f"{sensor.name} tracker {name}", str(getattr(config, name)), sources.get(f"tracker {name}", TUNED))
+        for name in names
+    ]

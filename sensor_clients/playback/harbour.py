@@ -28,6 +28,14 @@ SOURCES = {
     "initiation_delay": "chosen",
     "shade": "vessels up to 36 by 10 m, as the larger of the two; a radar's beam of 2.6 deg; wake and seen chosen",
     "resolves": "number of returns of the larger vessel in a scan",
+    "reach": "the farthest returns",
+    **dict.fromkeys(
+        ("sigma_range", "sigma_cross", "sigma_azimuth"), "innovations, without truth: these are still some .3 of it"
+    ),
+    "tracker hull": "as in shade",
+    "tracker extent": "hull in its place",
+    "tracker merge": "4: no farther apart than the hull",
+    "tracker min_way": "chosen",
 }
 """Where each number comes from; all others are `following.TUNED`."""
 
