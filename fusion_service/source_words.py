@@ -25,6 +25,7 @@ SHOWN: dict[str, tuple[str, str, float]] = {
     "heading": ("heading", "°", 180.0 / math.pi),
     "range": ("range", "m", 1.0),
     "scale": ("scale", "%", 100.0),
+    "drift": ("drift of the clock", "ms/s", 1000.0),
 }
 """Name, unit and factor by which each part of a bias is shown."""
 NO_ALARM = ("trusted", "")

@@ -35,8 +35,8 @@ MOVED = 25.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Applied:
-    """found: the error of a source is certain and matters; on: it is taken off, value (6,) with covariance (6, 6).
-    loose: too much of it stays uncertain to be neglected. looks: steps in a row that found it. told (6,), sigma (6,):
+    """found: the error of a source is certain and matters; on: it is taken off, value (7,) with covariance (7, 7).
+    loose: too much of it stays uncertain to be neglected. looks: steps in a row that found it. told (7,), sigma (7,):
     what the last event said."""
 
     found: bool = False

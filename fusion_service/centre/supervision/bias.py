@@ -1,14 +1,14 @@
 """The registration errors of a source, and what they do to what it says of a target.
 
-A source with the errors (clock, x, y, heading, range, scale) says of a target at u, seen from its own place p in the
-direction d = u - p,
+A source with the errors (clock, x, y, heading, range, scale, and drift, by which its clock changes in a second) says of
+a target at u, seen from its own place p in the direction d = u - p,
 
     p + t + R(heading) d (1 + scale + range / |d|)
 
 stamped `clock` seconds too late: what it says of time t was so at t - clock. To first order, v being the target's
 velocity and J a quarter turn to the left,
 
-    z = u + H theta,    H = [-v, e_x, e_y, J d, d / |d|, d]
+    z = u + H theta,    H = [-v, e_x, e_y, J d, d / |d|, d, 0]
 
 about its own place as its SensorInfo says it, or about the origin of the picture's frame where it says none.
 """
@@ -27,6 +27,7 @@ from fusion_service.geodesy import FrameError, transform
 
 __all__ = [
     "CLOCK",
+    "DRIFT",
     "HEADING",
     "PARAMETERS",
     "RANGE",
@@ -40,15 +41,17 @@ __all__ = [
     "site_of",
 ]
 
-PARAMETERS = ("clock", "x", "y", "heading", "range", "scale")
-"""s, m, m, rad, m, 1."""
-CLOCK, X, Y, HEADING, RANGE, SCALE = range(6)
-UNITS = ("s", "m", "m", "rad", "m", "")
+PARAMETERS = ("clock", "x", "y", "heading", "range", "scale", "drift")
+"""s, m, m, rad, m, 1, s/s."""
+CLOCK, X, Y, HEADING, RANGE, SCALE, DRIFT = range(7)
+DRIFT_SIGMA = 3e-4
+"""How fast clocks may drift."""
+UNITS = ("s", "m", "m", "rad", "m", "", "s/s")
 AXES = ("x", "y", "z")
 
 
 def design(place: Floats, velocity: Floats, site: Floats) -> Floats:
-    """H (2, 6, M) for targets at `place` (2, M), m, of `velocity` (2, M), m/s, seen from `site` (2, M)."""
+    """H (2, 7, M) for targets at `place` (2, M), m, of `velocity` (2, M), m/s, seen from `site` (2, M)."""
     away = place - site
     far = np.hypot(away[0], away[1])
     H = np.zeros((2, len(PARAMETERS), place.shape[1]))
@@ -79,7 +82,7 @@ def is_polar(intake: Intake, source: Source) -> bool:
 
 
 def prior_sigma(intake: Intake, source: Source) -> Floats:
-    """How large (6,) the errors of a source may be, 1 sigma; 0 is what it has not, and all of a reference."""
+    """How large (7,) the errors of a source may be, 1 sigma; 0 is what it has not, and all of a reference."""
     config = intake.config
     if config.source(source.name).reference:
         return np.zeros(len(PARAMETERS))
@@ -89,6 +92,6 @@ def prior_sigma(intake: Intake, source: Source) -> Floats:
     if stated is not None:
         place = [math.sqrt(stated[at, at]) for at in (config.space.index("x"), config.space.index("y"))]
     heading = math.radians(config.heading_sigma)
-    return np.array(
-        [config.clock_sigma, *place, heading, config.range_sigma * polar, config.scale_sigma * polar], dtype=np.float64
-    )
+    drift = DRIFT_SIGMA * (config.clock_sigma > 0)
+    ranges = config.range_sigma * polar, config.scale_sigma * polar
+    return np.array([config.clock_sigma, *place, heading, *ranges, drift], dtype=np.float64)

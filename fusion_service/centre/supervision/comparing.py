@@ -30,8 +30,8 @@ FINEST = 1e-4
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Treated:
-    """How the sources of the estimate (S,) stand, and what is taken off their rows already: site (2, S); value (S, 6);
-    common (S, 6, 6), what was added to the covariances of all their rows for it; shift (2, 2, S) likewise, as stated.
+    """How the sources of the estimate (S,) stand, and what is taken off their rows already: site (2, S); value (S, 7);
+    common (S, 7, 7), what was added to the covariances of all their rows for it; shift (2, 2, S) likewise, as stated.
     """
 
     site: Floats

@@ -28,8 +28,8 @@ PAIRS = (("x", "y"), ("vx", "vy"), ("ax", "ay"))
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Bias:
-    """The error of a source at `site` (2,) in the picture's `space`: value (6,), what is taken off, and covariance
-    (6, 6), what stays. loose: so much stays that it is no more to be neglected beside the errors of its tracks."""
+    """The error of a source at `site` (2,) in the picture's `space`: value (7,), what is taken off, and covariance
+    (7, 7), what stays. loose: so much stays that it is no more to be neglected beside the errors of its tracks."""
 
     space: tuple[str, ...]
     site: Floats

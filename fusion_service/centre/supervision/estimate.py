@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fusion_service.arrays import Bools, Floats, Ints, from_bytes, to_bytes
-from fusion_service.centre.supervision.bias import PARAMETERS
+from fusion_service.centre.supervision.bias import CLOCK, DRIFT, PARAMETERS
 
 __all__ = ["Group", "Information", "Posterior", "inverse_2x2"]
 
@@ -29,7 +29,7 @@ LOST = 1e-9
 @dataclass(frozen=True, slots=True, eq=False)
 class Group:
     """M rows of G shared targets, those of one target beside each other. source (M,): index into the names of the
-    estimate; group (M,), start (G,); H (2, 6, M); z (2, M), m; weight (2, 2, M), 1/m2, the inverse of its error."""
+    estimate; group (M,), start (G,); H (2, 7, M); z (2, M), m; weight (2, 2, M), 1/m2, the inverse of its error."""
 
     source: Ints
     group: Ints
@@ -45,18 +45,18 @@ class Group:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Posterior:
-    """mean (S, 6) and covariance (S, 6, S, 6)."""
+    """mean (S, 7) and covariance (S, 7, S, 7)."""
 
     mean: Floats
     covariance: Floats
 
     def of(self, at: int) -> tuple[Floats, Floats]:
-        """Mean (6,) and covariance (6, 6) of one source."""
+        """Mean (7,) and covariance (7, 7) of one source."""
         return self.mean[at], self.covariance[at, :, at]
 
     @property
     def variance(self) -> Floats:
-        """(S, 6)."""
+        """(S, 7)."""
         s, p = self.mean.shape
         return np.diagonal(self.covariance.reshape(s * p, s * p)).reshape(s, p)
 
@@ -76,9 +76,12 @@ class Information:
         self.vector = np.zeros((len(names), P))
         self.shared = np.zeros((len(names), len(names)))
 
-    def fade(self, kept: float) -> None:
-        """Keep this share of all that is known."""
+    def fade(self, kept: float, dt: float) -> None:
+        """Go on by `dt` seconds, in which clocks drift, and keep this share of all that is known."""
         self.matrix, self.vector, self.shared = kept * self.matrix, kept * self.vector, kept * self.shared
+        self.matrix[:, DRIFT] -= dt * self.matrix[:, CLOCK]
+        self.matrix[..., DRIFT] -= dt * self.matrix[..., CLOCK]
+        self.vector[:, DRIFT] -= dt * self.vector[:, CLOCK]
 
     def reweigh(self, before: Floats, now: Floats) -> None:
         """What the information of each source (S,) is divided by was `before`: it is `now`, on the mean of all of them
@@ -102,7 +105,7 @@ class Information:
         self.names, self.matrix, self.vector, self.shared = names, old.matrix, old.vector, old.shared
 
     def forget(self, at: int, which: Bools) -> None:
-        """Know nothing more of errors `which` (6,) of the source `at`, and of all others what is known without them:
+        """Know nothing more of errors `which` (7,) of the source `at`, and of all others what is known without them:
         they are integrated out."""
         flat = self.matrix.reshape(self.vector.size, -1)
         gone = np.zeros(self.vector.shape, dtype=np.bool_)
@@ -148,7 +151,7 @@ class Information:
         self.shared = self.shared + there.T @ there
 
     def posterior(self, sigma: Floats, gauge: Floats) -> Posterior:
-        """The estimate with `sigma` (S, 6) supposed beforehand, 0 for what is known to be 0, and K sums gauge (K, S, 6)
+        """The estimate with `sigma` (S, 7) supposed beforehand, 0 for what is known to be 0, and K sums gauge (K, S, 7)
         of errors, each in units of its sigma, kept at 0."""
         free = np.flatnonzero(sigma.ravel() > 0)
         scale = sigma.ravel()[free]

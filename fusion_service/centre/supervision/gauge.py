@@ -42,7 +42,7 @@ def connected(shared: Floats) -> Ints:
 
 
 def gauge_weights(sigma: Floats, label: Ints, mean: Floats, variance: Floats) -> Floats:
-    """How much each error (S, 6) weighs among those of the sources that hang together, besides its sigma (S, 6), by an
+    """How much each error (S, 7) weighs among those of the sources that hang together, besides its sigma (S, 7), by an
     estimate (mean, variance) in whatever gauge: 1 at the median."""
     weight = np.ones(sigma.shape)
     for first in np.unique(label).tolist():
@@ -57,7 +57,7 @@ def gauge_weights(sigma: Floats, label: Ints, mean: Floats, variance: Floats) ->
 
 
 def gauge(sigma: Floats, label: Ints, reference: Bools, weights: Floats) -> Floats:
-    """Sums (K, S, 6), in units of sigma (S, 6), that are kept at 0; weights (S, 6) as `gauge_weights` gives them."""
+    """Sums (K, S, 7), in units of sigma (S, 7), that are kept at 0; weights (S, 7) as `gauge_weights` gives them."""
     rows = []
     for first in np.unique(label).tolist():
         mine = np.flatnonzero(label == first)

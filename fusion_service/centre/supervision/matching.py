@@ -50,7 +50,7 @@ class Tracks2:
 
 def match(one: Tracks2, other: Tracks2, site: Floats, sigma: Floats) -> tuple[Ints, Ints]:
     """Tracks of `one` and `other` that are the same targets, (K,) each; none where that is not clear. site (2,): where
-    the other stands; sigma (6,): how large its errors beside those of the one may be."""
+    the other stands; sigma (7,): how large its errors beside those of the one may be."""
     none = np.zeros(0, dtype=np.intp)
     i, j = _candidates(one, other, site, sigma)
     near = min(len(np.unique(i)), len(np.unique(j)))

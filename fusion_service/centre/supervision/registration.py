@@ -22,7 +22,7 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.centre.supervision import telling
 from fusion_service.centre.supervision.applying import Applied, decide
-from fusion_service.centre.supervision.bias import CLOCK, PARAMETERS, prior_sigma, site_of
+from fusion_service.centre.supervision.bias import CLOCK, DRIFT, PARAMETERS, prior_sigma, site_of
 from fusion_service.centre.supervision.comparing import Compared, Treated, chosen_rows, compared, labels
 from fusion_service.centre.supervision.correction import Bias
 from fusion_service.centre.supervision.estimate import Information, Posterior
@@ -90,8 +90,9 @@ class Registration:
         self._step += 1
         whose = self._arrange(rows, names)
         if self._time >= 0:
-            kept = math.exp(-max(time - self._time, 0) / 1e9 / self._intake.config.registration_memory)
-            self._information.fade(kept)
+            dt = max(time - self._time, 0) / 1e9
+            kept = math.exp(-dt / self._intake.config.registration_memory)
+            self._information.fade(kept, dt)
             self._seen = kept * self._seen
         self._time = time
         if not self._information.names:
@@ -141,7 +142,7 @@ class Registration:
     def _restarted(self, at: int) -> None:
         """Its clock may be another; its place and heading are what they were."""
         which = np.zeros(P, dtype=np.bool_)
-        which[CLOCK] = True
+        which[[CLOCK, DRIFT]] = True
         self._information.forget(at, which)
         self._lasting.forget(at)
 
@@ -212,7 +213,7 @@ class Registration:
         self._known = _Known(sigma, label, reference, posterior, sites)
 
     def _standing(self, name: str) -> tuple[Floats, Floats]:
-        """How large the errors of a source may be (6,), and its place (2,); kept while it says the same of itself."""
+        """How large the errors of a source may be (7,), and its place (2,); kept while it says the same of itself."""
         source = self._intake.sources[name]
         kept = self._standings.get(name)
         if kept is None or kept[0] is not source.info:
@@ -282,7 +283,7 @@ class Registration:
         }
 
     def estimate(self, name: str) -> tuple[Floats, Floats]:
-        """The errors of a source: mean (6,) and covariance (6, 6). KeyError where it is in no estimate."""
+        """The errors of a source: mean (7,) and covariance (7, 7). KeyError where it is in no estimate."""
         if self._known is None or name not in self._information.names:
             raise KeyError(name)
         return self._known.posterior.of(self._information.names.index(name))

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service.arrays import Bools, Floats
-from fusion_service.centre.supervision.bias import CLOCK, PARAMETERS, UNITS, X, Y
+from fusion_service.centre.supervision.bias import CLOCK, DRIFT, PARAMETERS, UNITS, X, Y
 
 __all__ = ["OBSERVED", "Told", "entry", "note", "numbers", "observable"]
 
@@ -24,7 +24,7 @@ ONE_WAY = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Told:
-    """Of one source: mean (6,) and covariance (6, 6) of its errors, sigma (6,) supposed beforehand; seen (6,): faded
+    """Of one source: mean (7,) and covariance (7, 7) of its errors, sigma (7,) supposed beforehand; seen (6,): faded
     sums over its shared targets of 1, vx, vy, vx^2, vx vy, vy^2; shares: it has any with another source."""
 
     mean: Floats
@@ -35,12 +35,12 @@ class Told:
 
     @property
     def spread(self) -> Floats:
-        """Standard deviations (6,)."""
+        """Standard deviations (7,)."""
         return np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
 
 
 def observable(told: Told) -> Bools:
-    """Which errors (6,) the shared targets tell."""
+    """Which errors (7,) the shared targets tell."""
     return told.shares & (told.sigma > 0) & (told.spread <= OBSERVED * told.sigma)
 
 
@@ -65,8 +65,10 @@ def _why(told: Told, parameter: int) -> str:
     count = max(float(told.seen[0]), 1e-9)
     squares = np.array([[told.seen[3], told.seen[4]], [told.seen[4], told.seen[5]]]) / count
     values, axes = np.linalg.eigh(squares)
-    if parameter == CLOCK and math.sqrt(max(float(values.sum()), 0.0)) < SLOW:
+    if parameter in (CLOCK, DRIFT) and math.sqrt(max(float(values.sum()), 0.0)) < SLOW:
         return "its targets hardly move"
+    if parameter == DRIFT:
+        return "it is not seen for long enough"
     if parameter in (CLOCK, X, Y) and values[0] < ONE_WAY * values[1] and values[1] > SLOW**2:
         way = axes[:, 1]
         mean = float(told.seen[1] * way[0] + told.seen[2] * way[1]) / count

@@ -34,7 +34,7 @@ class Unlinked:
 
     def look(self, rows: Rows, whose: Ints, sites: Floats, sigma: Floats, space: tuple[str, ...], step: int) -> None:
         """Look at the next pair of sources. whose (N,): the number in the estimate of each source, or -1; sites (2, S),
-        sigma (S, 6): where those stand, and how large their errors may be."""
+        sigma (S, 7): where those stand, and how large their errors may be."""
         self._forget(rows, step)
         if not {"vx", "vy"} <= set(space):
             return

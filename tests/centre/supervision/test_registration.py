@@ -52,11 +52,11 @@ def test_a_clock_half_a_second_late_is_found_and_nothing_is_double_any_more() ->
 
 def test_errors_of_place_are_found_within_their_sigma() -> None:
     one = Offset(place=(-15e3, 8e3), x=50.0, heading=math.radians(1.0), range=100.0, polar=True)
-    for seed in range(3):
+    for seed in range(2):
         config = {**CORRECT, "sources": {"a": {"reference": True}}}
-        result = World({"a": Offset(place=(10e3, 0.0)), "b": one}, seed=seed, **config).run(30)
+        result = World({"a": Offset(place=(10e3, 0.0)), "b": one}, seed=seed, **config).run(25)
         off = wrong(result, "b", one)
-        assert set(off) == {"clock", "x", "y", "heading", "range", "scale"}
+        assert set(off) == {"clock", "x", "y", "heading", "range", "scale", "drift"}
         assert max(map(abs, off.values())) < 4.0, (seed, off)
         assert bias(result, "b")["heading"]["sigma"] < 2e-3
         assert result.status.sources["b"]["bias_applied"]
@@ -67,7 +67,7 @@ def test_errors_of_place_are_found_within_their_sigma() -> None:
 def test_estimates_are_as_uncertain_as_they_say(how: dict[str, Any]) -> None:
     """NEES over runs with other errors each: the mean over the 99.9 % interval of its chi-square, and not far below.
     Errors of a Kalman filter are not AR(1), and what it says of them holds for a target that its noise moves: below."""
-    runs, total = 6, []
+    runs, total = 4, []
     for seed in range(runs):
         x = np.random.default_rng([7, seed]).normal(size=3) * [0.05, 15.0, 15.0]
         one = Offset(clock=float(x[0]), x=float(x[1]), y=float(x[2]), sigma=(30.0, 2.0), **how)
@@ -77,7 +77,7 @@ def test_estimates_are_as_uncertain_as_they_say(how: dict[str, Any]) -> None:
         e = mean[:3] - x
         total.append(float(e @ np.linalg.solve(covariance[:3, :3], e)) / 3)
     print("NEES", np.round(total, 2))
-    assert 0.1 < np.mean(total) < 2.4  # 18 degrees of freedom: .27 to 2.35
+    assert 0.1 < np.mean(total) < 2.8  # 12 degrees of freedom: .18 to 2.74
 
 
 def test_two_errors_at_once_of_which_the_odd_ones_are_corrected() -> None:
@@ -134,7 +134,7 @@ def test_it_is_as_if_there_had_been_no_error() -> None:
     for one in (Offset(tracker=True), Offset(tracker=True, clock=0.1, x=15.0, y=10.0)):
         world = World({"a": Offset(tracker=True), "b": one}, **how)
         ids.append(set(world.run(8).tracks.ids.tolist()))
-        result = world.run(30)
+        result = world.run(20)
         ids[-1] &= set(result.tracks.ids.tolist())
         assert confirmed(result) == 25
         assert result.status.sources["b"]["no_tracklets"] == ""
@@ -168,9 +168,11 @@ def test_a_restarted_centre_goes_on_to_the_bit_and_a_restarted_source_keeps_its_
 
 
 def test_slow_drift_is_followed() -> None:
-    drifting = Offset(drift=2e-3)
-    result = World({"a": Offset(), "b": drifting}, registration_memory=10.0, **CORRECT, **A).run(60)
-    assert bias(result, "b")["clock"]["value"] == pytest.approx(0.12, abs=0.04), "it lags by the memory"
+    result = World({"a": Offset(), "b": Offset(drift=5e-4)}, **CORRECT, **A).run(80)
+    said = bias(result, "b")
+    assert abs(said["clock"]["value"] - 0.04) < 4 * said["clock"]["sigma"]
+    assert abs(said["drift"]["value"] - 5e-4) < 4 * said["drift"]["sigma"]
+    assert said["drift"]["observable"]
 
 
 def test_honest_sources_are_left_alone() -> None:
