@@ -37,13 +37,12 @@ class TrackerConfig:
     standard deviation per axis of a new track's velocity, m/s; gate: squared Mahalanobis distance;
     confirm, drop: existence at which a track is first reported and at which it ends, for a tentative track
     `drop_tentative`; max_sigma: a track whose position is less certain than this (m, along the worst of
-    its axes) ends, unless it is hidden; merge: squared distance of two tracks, under the sum of their covariances
-    and `extent`^2 (m2) on each axis of the place, below which the younger ends: returns of one large target; hull:
-    length and beam, m, of the largest: half of them as standard deviations along and across the elder's course, in
-    the place of `extent`, so that a `merge` of 4 means no farther apart than the hull (one that lies still: a circle of
-    that area); min_way, min_speed: a track is reported once it has been so far, m, from where it started, beyond two
-    standard deviations, and as long as that makes this speed over its age, m/s (0: at once); cubature: CKF, else
-    EKF."""
+    its axes) ends; merge: squared distance of two tracks, under the sum of their covariances and `extent`^2 (m2)
+    on each axis of the place, below which the younger ends: returns of one large target; hull: length and beam, m, of
+    the largest: half of them as standard deviations along and across the elder's course, in the place of `extent`, so
+    that a `merge` of 4 means no farther apart than the hull (one that lies still: a circle of that area); min_way,
+    min_speed: a track is reported once it has been so far, m, from where it started, beyond two standard deviations,
+    and as long as that makes this speed over its age, m/s (0: at once); cubature: CKF, else EKF."""
 
     motion: Motion
     survival: float
@@ -140,7 +139,7 @@ class LocalTracker:
         self.existence = found.existence
         claimed = np.where(self.reported(), found.existence, 0.0) @ found.weights
         self.updated = np.where(found.missed < 0.5, time, self.updated)
-        self._prune(None if hidden is None else hidden(self.means[:2]))
+        self._prune()
         self._start(returns, model, found.unused * birth / (clutter + birth))
         if hidden is not None:
             self._begin_anew(hidden(self.means[:2]) & ~self.reported(), time)
@@ -235,11 +234,10 @@ class LocalTracker:
         P = self.covariances
         return np.asarray(np.sqrt((P[0, 0] + P[1, 1]) / 2 + np.hypot((P[0, 0] - P[1, 1]) / 2, P[0, 1])))
 
-    def _prune(self, hidden: NDArray[np.bool_] | None) -> None:
+    def _prune(self) -> None:
         config = self.config
         floor = np.where(self.confirmed, config.drop, config.drop_tentative)
-        sure = self._worst_sigma() <= config.max_sigma
-        self._keep((self.existence >= floor) & (sure if hidden is None else sure | hidden))
+        self._keep((self.existence >= floor) & (self._worst_sigma() <= config.max_sigma))
         if config.merge and len(self.ids) > 1:
             i, j = np.triu_indices(len(self.ids), 1)
             spread = self.covariances[..., i] + self.covariances[..., j]

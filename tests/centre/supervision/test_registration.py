@@ -134,7 +134,7 @@ def test_it_is_as_if_there_had_been_no_error() -> None:
     for one in (Offset(tracker=True), Offset(tracker=True, clock=0.1, x=15.0, y=10.0)):
         world = World({"a": Offset(tracker=True), "b": one}, **how)
         ids.append(set(world.run(8).tracks.ids.tolist()))
-        result = world.run(20)
+        result = world.run(30)
         ids[-1] &= set(result.tracks.ids.tolist())
         assert confirmed(result) == 25
         assert result.status.sources["b"]["no_tracklets"] == ""
