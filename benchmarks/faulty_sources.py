@@ -101,7 +101,7 @@ def _words(said: dict[str, Any]) -> str:
     parts = [said.get("state", "")]
     if said.get("bias_note", "").startswith("no ") is False:
         parts.append(said.get("bias_note", ""))
-    parts += said.get("alarms", [])[:1]
+    parts += [*said.get("alarms", [])[:1], *([said["note"]] if said.get("note") else [])]
     if said.get("state") == "inflated":
         parts[0] += f" x {said['inflation_position']:.3g}, {said['inflation_velocity']:.3g}"
     return ", ".join(part for part in parts if part) or "-"

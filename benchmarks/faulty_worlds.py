@@ -256,7 +256,7 @@ def _catalogue() -> dict[str, Scene]:
     far = {"s0": range(8), "s1": range(4, 12), "s2": range(8, 16)}
     correlated = {"rule": "auto", "rule_options": {"max_correlation": {"within": 1.0, "between": 0.5}}}
     kinds: dict[str, Fault] = {
-        "clock .2 s": Fault(clock=0.2), "clock .5 s": Fault(clock=0.5), "clock 3 s": Fault(clock=3.0),
+        "clock .2 s": Fault(clock=0.2), "clock .5 s": Fault(clock=0.5), "clock 3 s": Fault(clock=3.0), "clock -3 s": Fault(clock=-3.0), "clock 1.5 s": Fault(clock=1.5),
         "shift 50 m": Fault(x=30.0, y=40.0), "shift 200 m": Fault(x=120.0, y=-160.0),
         "heading .3 deg": Fault(heading=0.3), "heading 1 deg": Fault(heading=1.0), "range 100 m": Fault(range=100.0),
         "sigma x 1/3": Fault(sigma=1 / 3), "sigma x 1/10": Fault(sigma=0.1), "sigma x 3": Fault(sigma=3.0),
