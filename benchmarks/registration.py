@@ -245,9 +245,12 @@ def road(data: Path) -> None:
     scenario = radar_v2x.load(radar_v2x.find(data))
     heard = [one for name in radar_v2x.SENSORS for one in of_events(name, scenario.sensors[name](0))]
     frame = {"kind": "enu", "lat": radar_v2x.FRAME.lat, "lon": radar_v2x.FRAME.lon}
-    usual: dict[str, Any] = {"frame": frame, "sources": {"vehicle1": {"reference": True}}, "translation_sigma": 20.0}
+    last = max(one.time for one in heard if one.source == "vehicle1" and isinstance(one, LocalTracks))
+    heard = [one for one in heard if getattr(one, "time", 0) <= last]
+    sources = {"vehicle1": {"reference": True}, "radar": {"registration_sigma": 10.0}}
+    usual: dict[str, Any] = {"frame": frame, "sources": sources, "period": 0.2, "registration_memory": 1e5}
     for clock_sigma in (1.0, 0.3, 0.0):
-        results = flown(heard, {**usual, "clock_sigma": clock_sigma, "registration_memory": 1e5})
+        results = flown(heard, {**usual, "clock_sigma": clock_sigma, "heading_sigma": 0.0})
         print(f"clock known to {clock_sigma} s: {told(results[-1], 'radar')}", flush=True)
 
 

@@ -8,8 +8,8 @@ beside the others of its target, of two successive blocks of N data with sums Q1
 
 has the expectation of that ratio but for terms that fall off with N as the autocorrelation does (twice the mean square
 of the sum of 2 N less that of N: what the ends of a block miss cancels). A row counts by its share in the variance of
-its residual, so that what is found is put down to the source that it comes from. Until blocks are full, the
-autocorrelation phi of successive residuals stands for it: (1 + phi) / (1 - phi).
+its residual, so that what is found is put down to the source that it comes from. Until blocks are full, the mean square
+of residuals and the autocorrelation phi of successive ones stand for it: E |q|^2 / 2 (1 + phi) / (1 - phi).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ __all__ = ["Followed", "Lasting", "match_rows", "robust"]
 
 BLOCK = 16
 """Data of a row."""
-FIRST_PHI, FIRST_DATA = 0.6, 50.0
+FIRST_PHI, FIRST_DATA = 0.6, 25.0
 """Autocorrelation that is supposed, and from how many data."""
 FIRST_BLOCKS = 10.0
 LEAST, MOST = 0.05, 1e4
@@ -57,26 +57,27 @@ class Followed:
 
 
 class Lasting:
-    """Of the sources of an estimate (S,): first, second: sums of |q|^2 and of products of successive q; found, blocks:
-    sum of ratios, weighted, and of weights."""
+    """Of the sources of an estimate (S,): first, second, count: sums of |q|^2 and of products of successive q, and how
+    many; found, blocks: sum of ratios, weighted, and of weights."""
 
     def __init__(self, count: int = 0) -> None:
-        self.first, self.second = np.zeros(count), np.zeros(count)
+        self.first, self.second, self.count = np.zeros(count), np.zeros(count), np.zeros(count)
         self.found, self.blocks = np.zeros(count), np.zeros(count)
         self.rows = Followed()
 
     @property
     def ratio(self) -> Floats:
         """(S,): by what the information of each is divided."""
-        phi = (self.second + FIRST_PHI * FIRST_DATA) / (self.first + FIRST_DATA)
+        phi = (self.second + 2.0 * FIRST_PHI * FIRST_DATA) / (self.first + 2.0 * FIRST_DATA)
         phi = np.clip(phi, 0.0, 0.95)
-        supposed = (1.0 + phi) / (1.0 - phi)
+        level = (self.first + 2.0 * FIRST_DATA) / (2.0 * (self.count + FIRST_DATA))
+        supposed = level * (1.0 + phi) / (1.0 - phi)
         return np.clip((self.found + FIRST_BLOCKS * supposed) / (self.blocks + FIRST_BLOCKS), LEAST, MOST)
 
     def arrange(self, to: Ints, count: int) -> None:
         """Sources move: that at k is at to[k] now, or gone (-1)."""
         stays = np.flatnonzero(to >= 0)
-        for name in ("first", "second", "found", "blocks"):
+        for name in ("first", "second", "count", "found", "blocks"):
             new = np.zeros(count)
             new[to[stays]] = getattr(self, name)[stays]
             setattr(self, name, new)
@@ -115,8 +116,9 @@ class Lasting:
         squares, products = (q**2).sum(axis=0)[had] * scale, (q * last).sum(axis=0)[had] * scale
         self.first += np.bincount(group.source[had], squares.clip(0, 50), minlength=size)
         self.second += np.bincount(group.source[had], products.clip(-50, 50), minlength=size)
-        kept = np.minimum(1.0, 50.0 * REMEMBERED / np.maximum(self.first, 1.0))
-        self.first, self.second = kept * self.first, kept * self.second
+        self.count += np.bincount(group.source[had], minlength=size)
+        kept = np.minimum(1.0, 2.0 * BLOCK * REMEMBERED / np.maximum(self.count, 1.0))
+        self.first, self.second, self.count = kept * self.first, kept * self.second, kept * self.count
         data = np.where(certain, data + 1, 0)
         half = np.where(data > BLOCK, 1, 0)
         block[:, half, np.arange(count)] += q
@@ -148,17 +150,18 @@ class Lasting:
 
     def packed(self) -> list[bytes]:
         """As plain values."""
-        return [to_bytes(one) for one in (self.first, self.second, self.found, self.blocks, *self.rows.columns())]
+        sums = self.first, self.second, self.count, self.found, self.blocks
+        return [to_bytes(one) for one in (*sums, *self.rows.columns())]
 
     @classmethod
     def unpacked(cls, packed: list[bytes]) -> Lasting:
         """From what `packed` gave."""
         made = cls()
-        parts = [from_bytes(part, made.first) for part in packed[:4]]
-        made.first, made.second, made.found, made.blocks = parts
+        parts = [from_bytes(part, made.first) for part in packed[:5]]
+        made.first, made.second, made.count, made.found, made.blocks = parts
         like = made.rows.columns()
         columns = [
-            from_bytes(part, one).reshape(*one.shape[:-1], -1) for part, one in zip(packed[4:], like, strict=True)
+            from_bytes(part, one).reshape(*one.shape[:-1], -1) for part, one in zip(packed[5:], like, strict=True)
         ]
         made.rows = Followed(columns)
         return made

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -170,14 +170,14 @@ class Registration:
             self._estimate(sites)
         assert self._known is not None
         expected = self._residual(part, self._known.posterior.mean)
-        group = robust(group, expected, 1.0 / self._lasting.ratio[group.source])
-        self._information.add(group)
+        factor = 1.0 / self._lasting.ratio[group.source]
+        self._information.add(robust(group, expected, factor))
         self._estimate(sites)
         certain = self._certain(part)
         residual = self._residual(part, self._known.posterior.mean)
         ids, updated = tracks.id[part.row], tracks.updated[part.row]
         before = self._lasting.ratio
-        self._lasting.learn(group, ids, updated, residual, certain)
+        self._lasting.learn(replace(group, weight=group.weight * factor), ids, updated, residual, certain)
         self._information.reweigh(before, self._lasting.ratio)
         self._estimate(sites)  # of what is kept: a centre that starts from its checkpoint has no other
         v = part.velocity[:, group.group]
