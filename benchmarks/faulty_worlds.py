@@ -31,7 +31,7 @@ BIG = np.uint64(1_000_000)
 class Wrong:
     """A fault of a source: fault, or one that changes, `later(t)`, t in s; begin, end, s, of either; deviations: it
     sends standard deviations as variances; ghosts: so many targets of its own; restart: s, when it begins anew with new
-    ids; white: errors drawn anew for each message, whatever its filter does."""
+    ids; frozen: from when on, s, it says the same again and again."""
 
     fault: Fault = Fault()
     later: Callable[[float], Fault] | None = None
@@ -40,6 +40,7 @@ class Wrong:
     deviations: bool = False
     ghosts: int = 0
     restart: float = math.inf
+    frozen: float = math.inf
 
     def at(self, time: float) -> Fault:
         """What is wrong at a time, s."""
@@ -113,7 +114,7 @@ def _heard(scene: Scene, sensor: Sensor, path: Path, rng: np.random.Generator) -
     if also is not None:  # as many scans as there are
         count = len(_scan_times(sensor, scene.seconds))
         also = also[0][:count], also[1]
-    out, info, run = [], None, 1
+    out, info, run, held = [], None, 1, None
     for received, message, target in told(sensor, observe(sensor, path, scene.seconds, rng, seen=visible, also=also)):
         if isinstance(message, SensorInfo):
             info = message
@@ -125,7 +126,11 @@ def _heard(scene: Scene, sensor: Sensor, path: Path, rng: np.random.Generator) -
             out.append((received - 1, replace(info, epoch=2, sent=received - 1)))
         if scene.white and target is not None:
             message = _drawn(message, path(np.array([time]))[0][target], rng)
-        out.append((received, _made(message, wrong, time, sensor, run)))
+        if time < wrong.frozen or held is None:
+            held = message
+        same = {name: getattr(held, name) for name in ("ids", "means", "covariances")}
+        again = replace(message, updated=held.updated + (message.time - held.time), **same)
+        out.append((received, _made(again, wrong, time, sensor, run)))
     return out
 
 
@@ -262,7 +267,7 @@ def _catalogue() -> dict[str, Scene]:
         "sigma x 1/3": Fault(sigma=1 / 3), "sigma x 1/10": Fault(sigma=0.1), "sigma x 3": Fault(sigma=3.0),
     }  # fmt: skip
     polar = {"sources": {"s1": {"polar": True}}}
-    stuck = Wrong(Fault(stuck=40.0))
+    stuck = Wrong(frozen=40.0)
     scenes = {
         "sound 2": Scene(sensors(2), ten),
         "sound 3": Scene(sensors(3), ten),
@@ -282,7 +287,7 @@ def _catalogue() -> dict[str, Scene]:
         "partial overlap": Scene(sensors(3), random_walks(16), seen=far),
         "one 10 x as precise": Scene(_changed(0, 3, sigma=1.5), ten),
         "declared correlation": Scene(sensors(3), ten, config=correlated),
-        "clutter": Scene(sensors(3), ten, clutter=10.0),
+        "clutter": Scene(sensors(3), ten, clutter=3.0),
     }
     scenes |= {name: _one(Wrong(fault)) for name, fault in kinds.items()}
     scenes["range 100 m, polar"] = _one(Wrong(Fault(range=100.0)), config=polar)

@@ -26,7 +26,7 @@ from fusion_service.centre.supervision.bias import CLOCK, DRIFT, PARAMETERS, pri
 from fusion_service.centre.supervision.comparing import Compared, Treated, chosen_rows, compared, labels
 from fusion_service.centre.supervision.correction import Bias
 from fusion_service.centre.supervision.estimate import Information, Posterior
-from fusion_service.centre.supervision.gauge import connected, gauge, gauge_weights, gauge_words
+from fusion_service.centre.supervision.gauge import connected, gauge, gauge_weights, gauge_words, halved
 from fusion_service.centre.supervision.lasting import Lasting, robust
 from fusion_service.centre.supervision.shared import Shared
 from fusion_service.centre.supervision.unlinked import Unlinked
@@ -253,6 +253,9 @@ class Registration:
         for at, name in enumerate(self._information.names):
             told, before = self._told(at), self._applied.get(name, Applied())
             after, what = decide(before, told, self._effect[at], self._intake.config.supervision_errors, corrects)
+            if after.on and halved(self._known.label, self._known.reference, at):  # which half of it is right?
+                both = after.covariance + np.outer(after.value, after.value)
+                after = replace(after, covariance=both, loose=True)
             self._applied[name] = after
             if what:
                 words = telling.note(told, after.on, after.found, corrects)
@@ -268,6 +271,15 @@ class Registration:
         site = self._known.sites[:, self._information.names.index(name)]
         bias = Bias(self._intake.config.space, site, applied.value, applied.covariance, applied.loose)
         return round(applied.value[CLOCK] * 1e9), bias
+
+    def same(self) -> dict[int, int]:
+        """{global track: the older one that it is the same target as}, though nothing links them."""
+        return self._unlinked.same()
+
+    def told(self, name: str) -> tuple[bool, bytes]:
+        """Whether anything is taken off a source, and what the last event said of it."""
+        applied = self._applied.get(name, Applied())
+        return applied.on, applied.told.tobytes()
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
