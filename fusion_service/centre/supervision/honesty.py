@@ -40,9 +40,11 @@ MOST_SOURCE_PAIRS = 4096
 MOST_NAMES = 2000
 FEW = 3.0
 """Independent differences without which nothing is said of a pair."""
+EXPLAINED = 0.05
+"""Part of the scale of a pair's differences, from which a change of a correction makes them others."""
 RECENT = 5.0
 """Steps that the recent mean is about."""
-MENDED, FORGOTTEN = 0.25, 0.8
+MENDED, FORGOTTEN = 0.4, 0.8
 """Part of a scale, below which the recent mean says that it is no more, and what is kept then, of what was before."""
 MATTERS = 1.25
 """A factor on variances below which nothing is said, though it may be no chance."""
@@ -291,12 +293,18 @@ class Honesty:
         place = {name: i for i, name in enumerate(self._names)}
         return [(place[name], *value) for name, value in sorted(own.items()) if name in place]
 
-    def forget(self, names: set[str]) -> None:
-        """What these sources say is from now on another thing: it is corrected, or no more."""
-        gone = np.array([i for i, name in enumerate(self._names) if name in names], dtype=np.intp)
-        first, second = self._sums.key // BASE, self._sums.key % BASE
-        self._sums = self._sums.take(~np.isin(first, gone) & ~np.isin(second, gone))
-        self._factors[:, gone] = 1.0
+    def forget(self, size: Mapping[str, float]) -> None:
+        """What these sources say is from now on another thing: it is corrected, or no more. size: mean square of what
+        has changed, beside the errors that it says; pairs of which that is little of their differences are kept."""
+        sums = self._sums
+        by_number = np.array([size.get(name, 0.0) for name in self._names])
+        weight = sums.weight[:, 0]
+        share = np.clip(sums.share[:, 0] / np.where(weight > 0.0, weight, 1.0), 0.0, 1.0)
+        first, second = sums.key // BASE, sums.key % BASE
+        with np.errstate(invalid="ignore"):
+            part = np.fmax(by_number[first] * share, by_number[second] * (1.0 - share))
+        scale = robust_scale(sums.histogram[:, 0], max(len(self._blocks[0]), 1))
+        self._sums = sums.take(part <= EXPLAINED * scale)
 
     def rebase(self) -> None:
         """A new era begins: tracks of before are not compared with those of after."""

@@ -139,6 +139,15 @@ class Registration:
         self._epochs = {name: self._intake.sources[name].epoch for name in new}
         return np.array([new.index(name) if name in new else -1 for name in names], dtype=np.intp)
 
+    def forget(self, name: str) -> None:
+        """All that a source says has jumped: its errors are other ones."""
+        if name in self._information.names:
+            at = self._information.names.index(name)
+            self._information.forget(at, np.ones(P, dtype=np.bool_))
+            self._lasting.forget(at)
+            self._applied[name] = Applied()
+            self._estimate(self._how().site)
+
     def _restarted(self, at: int) -> None:
         """Its clock may be another; its place and heading are what they were."""
         which = np.zeros(P, dtype=np.bool_)
@@ -280,6 +289,11 @@ class Registration:
         """Whether anything is taken off a source, and what the last event said of it."""
         applied = self._applied.get(name, Applied())
         return applied.on, applied.told.tobytes()
+
+    def size(self, name: str) -> float:
+        """Mean square of the error of a source beside those that its tracks have of their own."""
+        names = self._information.names
+        return float(self._effect[names.index(name), 0]) if name in names else 0.0
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""

@@ -55,6 +55,9 @@ class Supervisor:
         """Learn from a step, its links decided and nothing fused yet, and settle how sources are treated in the next.
         now: the picture predicted to `time`, ns; own: what is known of the sources' own innovations."""
         self.conduct.observe(rows, names, time, journal)
+        jumped = {name for name in names if self.conduct.jumped(name, time)}
+        for name in sorted(jumped):
+            self.registration.forget(name)
         shared = shared_pairs(rows, step)
         before = [self.registration.told(name) for name in names]
         self.registration.observe(rows, names, now, shared, time, journal)
@@ -67,7 +70,8 @@ class Supervisor:
             self._opinions = self._honesty.opinions(self._chance(time), own or {})
             for event in self.states.settle(names, self._opinions, self._orders(), self._stuck(names), time):
                 journal.event(event)
-            self._honesty.forget(self._otherwise(names, before))
+            if changed := self._otherwise(names, before) | dict.fromkeys(jumped, np.inf):
+                self._honesty.forget(changed)
         self._treat(names)
 
     def _beside(self, rows: Rows, shared: Shared, step: int) -> Shared:
@@ -76,10 +80,14 @@ class Supervisor:
         same = self.registration.same() if self._config.registration == "estimate" else {}
         return shared_pairs(rows, step, labels(rows, same)) if same else shared
 
-    def _otherwise(self, names: tuple[str, ...], before: list[tuple[bool, bytes]]) -> set[str]:
-        """The sources of which other errors are taken off from now on than `before`."""
+    def _otherwise(self, names: tuple[str, ...], before: list[tuple[bool, bytes]]) -> dict[str, float]:
+        """The sources of which other errors are taken off from now on than `before`, and how large they are."""
         now = [self.registration.told(name) for name in names]
-        return {name for name, was, one in zip(names, before, now, strict=True) if was != one and (was[0] or one[0])}
+        return {
+            name: self.registration.size(name)
+            for name, was, one in zip(names, before, now, strict=True)
+            if was != one and (was[0] or one[0])
+        }
 
     def _applied(self, names: tuple[str, ...]) -> Floats:
         """By what (2, S) the covariances of the sources are multiplied in this step."""
