@@ -158,7 +158,7 @@ class Honesty:
         for name, new in more:
             column = getattr(sums, name)
             column[:, block] = kept * (column[:, block] + new)
-        self._mended(block, scale, count, np.bincount(pair, minlength=K, weights=np.minimum(square, cut)))
+        self._mended(block, scale, count, np.bincount(pair, np.minimum(square, cut), K))
         if difference is None:
             return
         usual = square < cut

@@ -236,7 +236,7 @@ def test_of_two_that_contradict_each_other_neither_is_believed_alone() -> None:
 
 
 def test_innovations_alone_are_no_contradiction() -> None:
-    """Errors drawn anew are no filter's: the innovations of both say so, and their covariances are right all the same."""
+    """Errors drawn anew are no filter's: the innovations of both say so, and their covariances are right."""
     two = ("r1", "r3")
     results = flown(two, honest, 20)
     assert not changes(results)
