@@ -166,7 +166,7 @@ class Honesty:
             for column, value in ((sums.offset, r), (sums.squared, r * r)):
                 column[:, axis] = kept * (column[:, axis] + np.bincount(pair[usual], weights=value, minlength=K))
 
-    def _mended(self, block: int, scale: Floats, count: Floats, square: Floats) -> None:
+    def _mended(self, block: int, scale: Floats, count: Ints, square: Floats) -> None:
         """Forget soon what is no more: of pairs (K,) whose differences, `count` new ones with the sum `square`, have
         become far smaller than their `scale` says. What has been mended is to be seen before it fades by itself."""
         sums, there = self._sums, count > 0

@@ -66,7 +66,7 @@ class Supervisor:
             if self._frame != self._intake.frame:
                 self._honesty.rebase()
                 self._frame = self._intake.frame
-            self._honesty.observe(rows, names, self._beside(rows, shared, step), self._applied(names))
+            self._honesty.observe(rows, names, self._beside(rows, names, shared, step), self._applied(names))
             self._opinions = self._honesty.opinions(self._chance(time), own or {})
             for event in self.states.settle(names, self._opinions, self._orders(), self._stuck(names), time):
                 journal.event(event)
@@ -74,11 +74,19 @@ class Supervisor:
                 self._honesty.forget(changed)
         self._treat(names)
 
-    def _beside(self, rows: Rows, shared: Shared, step: int) -> Shared:
-        """The pairs that are compared: where errors of clock and place are told only, also those of targets that these
-        are too large for any link of. Unsure of itself by that much, a source is linked and shows nothing twice."""
-        same = self.registration.same() if self._config.registration == "estimate" else {}
-        return shared_pairs(rows, step, labels(rows, same)) if same else shared
+    def _beside(self, rows: Rows, names: tuple[str, ...], shared: Shared, step: int) -> Shared:
+        """The pairs that are compared: also those of targets that errors of clock and place are too large for any link
+        of, where these are told only, or what is taken off does not mend it. Unsure of itself by that much, a source is
+        linked and shows nothing twice."""
+        same = self.registration.same()
+        if not same:
+            return shared
+        told_only = self._config.registration == "estimate"
+        wide = shared_pairs(rows, step, labels(rows, same))
+        tried = np.array([told_only or self.registration.told(name)[0] for name in names], dtype=np.bool_)[rows.source]
+        link = rows.tracks.link
+        kept = (link[wide.first] == link[wide.second]) | tried[wide.first] | tried[wide.second]
+        return Shared(wide.first[kept], wide.second[kept])
 
     def _otherwise(self, names: tuple[str, ...], before: list[tuple[bool, bytes]]) -> dict[str, float]:
         """The sources of which other errors are taken off from now on than `before`, and how large they are."""

@@ -47,7 +47,10 @@ class Unlinked:
         if rows.tracks.origin[a[0]] != rows.tracks.origin[b[0]]:
             return
         both = np.hypot(sigma[whose[one]], sigma[whose[other]])
-        i, j = match(_plane(rows, a, space), _plane(rows, b, space), sites[:, whose[other]], both)
+        first, second = _plane(rows, a, space), _plane(rows, b, space)
+        i, j = match(first, second, sites[:, whose[other]], both)
+        if not len(i):  # a turn, and ranges, are about the place of one of them
+            j, i = match(second, first, sites[:, whose[one]], both)
         self._count(rows.tracks.link, a, b, set(zip(a[i].tolist(), b[j].tolist(), strict=True)), step)
 
     def _count(self, link: Any, a: Ints, b: Ints, found: set[tuple[int, int]], step: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,32 @@ def test_where_an_error_is_told_only_nothing_is_shown_twice() -> None:
     assert states(results, "b")[-5:] == ["inflated"] * 5
     assert set(states(results, "a")) | set(states(results, "c")) == {"trusted"}
     assert scores(world, results[-1]) < 1.5
+
+
+@pytest.mark.parametrize("how", ["estimate", "correct"])
+@pytest.mark.parametrize("which", ["a", "b"])
+def test_a_turned_source_is_found_whatever_its_name(how: str, which: str) -> None:
+    """A turn about the place of one source is none about that of another, with which it is compared too."""
+    places = {"a": (-8e3, 0.0), "b": (8e3, 0.0), "c": (0.0, 8e3)}
+    sources = {name: replace(GOOD, place=place) for name, place in places.items()}
+    sources[which] = replace(sources[which], heading=np.radians(1.0))
+    world = World(sources, 12, speed=60.0, seed=3, spread=10e3, registration=how, **RULED)
+    results = [world.step() for _ in range(25)]
+    assert shown(results[-1]) == 12
+    assert results[-1].status.sources[which]["bias"]["heading"]["value"] == pytest.approx(np.radians(1.0), rel=0.2)
+
+
+def test_what_no_correction_mends_is_covered_in_part() -> None:
+    """Ranges that are too long, of a source that does not say that it measures ranges."""
+    places = {"a": (-8e3, 0.0), "b": (8e3, 0.0), "c": (0.0, 8e3)}
+    sources = {name: replace(GOOD, place=place) for name, place in places.items()}
+    sources["b"] = replace(sources["b"], range=120.0)
+    results = {}
+    for how in ({"registration": "correct"}, {"registration": "off", "supervision": "off"}):
+        world = World(sources, 12, speed=60.0, seed=3, spread=10e3, **how, **RULED)
+        results[how["registration"]] = [world.step() for _ in range(40)]
+    assert shown(results["correct"][-1]) <= 0.75 * shown(results["off"][-1])
+    assert {states(results["correct"], name)[-1] for name in "ac"} == {"trusted"}
 
 
 def test_a_source_that_is_corrected_is_judged_anew() -> None:
