@@ -22,6 +22,7 @@ import sys
 import tomllib
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import TypeAlias
 
@@ -42,11 +43,21 @@ Pair: TypeAlias = tuple[HarbourSensor, HarbourSensor]
 NAMES = ("lidar", "radar", "fused")
 
 
+@lru_cache
+def scans_of(directory: Path, number: int, sensor_id: int) -> list[autoferry.Scan]:
+    return autoferry.read_scans(directory / f"scenario{number}_detections.json", sensor_id)
+
+
+@lru_cache
+def truth_of(directory: Path, number: int) -> tuple[Message, ...]:
+    return tuple(messages("truth", autoferry.load(directory, number).truth()))
+
+
 def spoken(directory: Path, number: int, sensors: Pair) -> list[Message]:
     """What the sensors say in a scenario, in the order of time."""
     said: list[Message] = []
     for sensor in sensors:
-        scans = autoferry.read_scans(directory / f"scenario{number}_detections.json", sensor.sensor_id)
+        scans = scans_of(directory, number, sensor.sensor_id)
         said += messages(sensor.name, autoferry.sensor_events(sensor, scans))
     return sorted(said, key=lambda message: message.sent)
 
@@ -58,8 +69,7 @@ def scores(directory: Path, sensors: Pair, note: str = "") -> Floats:
         print(f"\r{note} scenario {number}   ", end="", file=sys.stderr, flush=True)
         said = spoken(directory, number, sensors)
         pictures = missions.fuse(said, {**tomllib.loads(AUTOFERRY), "rule": "auto"})  # type: ignore[arg-type]
-        truth = messages("truth", autoferry.load(directory, number).truth())
-        result = evaluate([*said, *truth, *pictures], c=20.0, every=1.0)
+        result = evaluate([*said, *truth_of(directory, number), *pictures], c=20.0, every=1.0)
         found = [*(result.sources[name] for name in NAMES[:2]), result.fused]
         rows.append([[float(getattr(one, metric) or 0.0) for metric in METRICS] for one in found])
     print("\r" + " " * 60 + "\r", end="", file=sys.stderr)
