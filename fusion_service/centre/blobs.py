@@ -46,6 +46,8 @@ MOST = 200_000
 """Links remembered."""
 CHAIN = 3
 """Rows in turn that take each other's places at most."""
+TRIFLE = 1e-12
+"""By which what a row may be off is larger: its own error may be less than what is lost in rounding."""
 
 Ids = NDArray[np.uint64]
 
@@ -150,6 +152,7 @@ class Shared:
         more = np.zeros((3, len(rows.source)))
         for part, product in zip(more, (x * x, x * y, y * y), strict=True):
             np.add.at(part, row, product)
+        more[[0, 2]] *= 1.0 + TRIFLE
         column = column.copy()
         column[8:11, row] = more[:, row]
         tracks = widened(replace(rows.tracks, extent=column), more, self._space, self._frame)
