@@ -211,7 +211,7 @@ class Honesty:
             pairs, some = self._pairs(block, k)
             enough = pairs.count >= FEW
             pairs, some = pairs.take(enough), some[enough]
-            pairs, sure = _with_innovations(pairs, S, self._innovations(own), k)
+            pairs, sure = _with_innovations(pairs, S, self._innovations(own), z)
             found = solved(pairs, self._factors[block])
             self._factors[block] = found.value
             wrong[block] = sure & _beyond(found, z)
@@ -312,11 +312,14 @@ def _whitened(P: Floats, Q: Floats, r: Floats) -> tuple[Floats, Floats]:
         return y / np.sqrt(d), linalg.inner(linalg.inverse(S), P) / len(r)
 
 
-def _with_innovations(pairs: Pairs, S: int, own: list[tuple[int, float, float]], k: int) -> tuple[Pairs, Bools]:
+def _with_innovations(pairs: Pairs, S: int, own: list[tuple[int, float, float]], z: float) -> tuple[Pairs, Bools]:
     """The pairs, with what sources say of themselves where the pairs alone leave it open who is wrong; and of whom
-    (S,) it is known then."""
-    sure = decidable(pairs, S)
-    open_ = [one for one in own if not sure[one[0]]]
+    (S,) it is known then. Only of sources that contradict another: innovations depend on the motion that is declared
+    too, and tell which of two is wrong, not whether one is."""
+    sure, k = decidable(pairs, S), pairs.k
+    suspect = _pair_beyond(pairs, z)
+    against = np.isin(np.arange(S), np.concatenate([pairs.first[suspect], pairs.second[suspect]]))
+    open_ = [one for one in own if against[one[0]] and not sure[one[0]]]
     if not open_:
         return pairs, sure
     at = np.array([i for i, _, _ in open_], dtype=np.intp)

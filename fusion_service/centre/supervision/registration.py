@@ -180,6 +180,7 @@ class Registration:
         before = self._lasting.ratio
         self._lasting.learn(replace(group, weight=group.weight * factor), ids, updated, residual, certain)
         self._information.reweigh(before, self._lasting.ratio)
+        self._estimate(sites)  # of what is kept: a centre that starts from its checkpoint has no other
         v = part.velocity[:, group.group]
         what = (np.ones(len(part.row)), v[0], v[1], v[0] ** 2, v[0] * v[1], v[1] ** 2)
         self._seen = self._seen + np.stack(

@@ -16,7 +16,7 @@ from fusion_service.arrays import Floats
 from fusion_service.centre import FusionCentre, Order, StepResult
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.supervision.hat import Pairs, decidable, solved
-from fusion_service.centre.supervision.honesty import Honesty, Opinion
+from fusion_service.centre.supervision.honesty import Honesty, Opinion, _with_innovations
 from fusion_service.centre.supervision.scale import BINS, binned, high_bound, low_bound, robust_scale, sigmas
 from fusion_service.centre.supervision.shared import shared_pairs
 from fusion_service.centre.supervision.states import States
@@ -224,6 +224,18 @@ def test_of_two_that_contradict_each_other_neither_is_believed_alone() -> None:
     rules = results[-1].tracks.rules
     assert rules is not None
     assert "cu" in rules
+
+
+def test_innovations_alone_are_no_contradiction() -> None:
+    """Errors drawn anew are no filter's: the innovations of both say so, and their covariances are right all the same."""
+    two = ("r1", "r3")
+    results = flown(two, honest, 20)
+    assert not changes(results)
+    for scale, wrong in ((1.0, False), (5.0, True)):
+        rng = np.random.default_rng(SEED)
+        pairs = all_pairs(2, np.array([1.0, 2.0 * scale - 1.0]), np.full(2, 100.0), 400.0, rng)
+        joined, sure = _with_innovations(pairs, 2, [(0, 3.0, 400.0), (1, 9.0, 400.0)], 4.0)
+        assert (len(joined.first), sure.tolist()) == ((3, [True, True]) if wrong else (1, [False, False]))
 
 
 def test_an_order_settles_it_until_it_is_withdrawn() -> None:
