@@ -314,9 +314,10 @@ def _whitened(P: Floats, Q: Floats, r: Floats) -> tuple[Floats, Floats]:
 
 def _with_innovations(pairs: Pairs, S: int, own: list[tuple[int, float, float]], k: int) -> tuple[Pairs, Bools]:
     """The pairs, with what sources say of themselves where the pairs alone leave it open who is wrong; and of whom
-    (S,) it is known then."""
-    sure = decidable(pairs, S)
-    open_ = [one for one in own if not sure[one[0]]]
+    (S,) it is known then. A source that is in no pair is beside nobody, and nothing is to be thought of it."""
+    sure, compared = decidable(pairs, S), np.zeros(S, dtype=np.bool_)
+    compared[pairs.first] = compared[pairs.second] = True
+    open_ = [one for one in own if compared[one[0]] and not sure[one[0]]]
     if not open_:
         return pairs, sure
     at = np.array([i for i, _, _ in open_], dtype=np.intp)
