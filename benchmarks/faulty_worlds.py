@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks.worlds.kalman import transition
-from benchmarks.worlds.world import FRAME, SPACE, Floats, Path, Sensor, flickers, ns, observe, told
+from benchmarks.worlds.world import FRAME, Floats, Path, Sensor, flickers, ns, observe, scan_times, told
 from schemas import LocalTracks, SensorInfo
 from sensor_clients.events import Event
 from sensor_clients.faults import Fault, faulty
 
-__all__ = ["WORLDS", "Scene", "Wrong", "World"]
+__all__ = ["WORLDS", "Scene", "World", "Wrong"]
 
 Q = 0.5
 FINE = 0.25
@@ -31,7 +31,7 @@ BIG = np.uint64(1_000_000)
 class Wrong:
     """A fault of a source: fault, or one that changes, `later(t)`, t in s; begin, end, s, of either; deviations: it
     sends standard deviations as variances; ghosts: so many targets of its own; restart: s, when it begins anew with new
-    ids; white: errors drawn anew for each message, whatever its filter does."""
+    ids; frozen: from when on, s, it says the same again and again."""
 
     fault: Fault = Fault()
     later: Callable[[float], Fault] | None = None
@@ -40,6 +40,7 @@ class Wrong:
     deviations: bool = False
     ghosts: int = 0
     restart: float = math.inf
+    frozen: float = math.inf
 
     def at(self, time: float) -> Fault:
         """What is wrong at a time, s."""
@@ -92,6 +93,7 @@ class World:
 
 
 def _heard(scene: Scene, sensor: Sensor, path: Path, rng: np.random.Generator) -> list[tuple[int, Any]]:
+    """What a sensor says, wrong as it is."""
     wrong = scene.wrong.get(sensor.name, Wrong())
     some = scene.seen.get(sensor.name)
     also = None
@@ -101,7 +103,7 @@ def _heard(scene: Scene, sensor: Sensor, path: Path, rng: np.random.Generator) -
         also = places, np.full(places.shape[1], -1)
     if wrong.ghosts:
         times = sensor.period * np.arange(1, scans + 1)
-        own = random_walks(wrong.ghosts)(rng, scene.seconds + 60)(times)[..., :2]
+        own = np.array(random_walks(wrong.ghosts)(rng, scene.seconds + 60)(times)[..., :2])
         own[(times < wrong.begin) | (times >= wrong.end)] = np.nan
         also = own, np.full(wrong.ghosts, -1)
 
@@ -111,38 +113,40 @@ def _heard(scene: Scene, sensor: Sensor, path: Path, rng: np.random.Generator) -
         return there
 
     if also is not None:  # as many scans as there are
-        count = len(_scan_times(sensor, scene.seconds))
-        also = also[0][:count], also[1]
-    out, info, run = [], None, 1
+        also = also[0][: len(scan_times(sensor, scene.seconds))], also[1]
+    out: list[tuple[int, Any]] = []
+    info, run, held = None, 1, None
     for received, message, target in told(sensor, observe(sensor, path, scene.seconds, rng, seen=visible, also=also)):
         if isinstance(message, SensorInfo):
             info = message
             out.append((received, message))
             continue
         time = (message.time - ns(0.0)) / 1e9
-        if time >= wrong.restart and run == 1:
+        if time >= wrong.restart and run == 1 and info is not None:
             run = 2
             out.append((received - 1, replace(info, epoch=2, sent=received - 1)))
         if scene.white and target is not None:
             message = _drawn(message, path(np.array([time]))[0][target], rng)
-        out.append((received, _made(message, wrong, time, sensor, run)))
+        if time < wrong.frozen or held is None:
+            held = message
+        assert held.updated is not None
+        same = {name: getattr(held, name) for name in ("ids", "means", "covariances")}
+        again = replace(message, updated=held.updated + (message.time - held.time), **same)
+        out.append((received, _made(again, wrong, time, sensor, run)))
     return out
-
-
-def _scan_times(sensor: Sensor, seconds: float) -> Floats:
-    first = sensor.phase or sensor.period
-    return first + sensor.period * np.arange(int((seconds - first) / sensor.period + 1e-9) + 1)
 
 
 def _drawn(message: LocalTracks, states: Floats, rng: np.random.Generator) -> LocalTracks:
     """The same with errors drawn anew, by what it says of them."""
-    root = np.linalg.cholesky(message.covariances)
-    return replace(message, means=states + np.einsum("tij,tj->ti", root, rng.normal(size=states.shape)))
+    root = np.linalg.cholesky(message.covariances).astype(np.float64)
+    errors = (root @ rng.normal(size=states.shape)[..., None])[..., 0]
+    return replace(message, means=states + errors)
 
 
 def _made(message: LocalTracks, wrong: Wrong, time: float, sensor: Sensor, run: int) -> LocalTracks:
+    """A message of the `run`th run of a sensor as its fault at `time`, s, makes it."""
     fault = wrong.at(time)
-    fields = {"space": message.space, "means": message.means, "covariances": message.covariances}
+    fields: dict[str, Any] = {"space": message.space, "means": message.means, "covariances": message.covariances}
     fields["updated"] = message.updated
     info = Event(message.time, "info", {"position": (*sensor.place, 0.0)})
     made = list(faulty(iter([info, Event(message.time, "tracks", fields)]), fault))[-1]
@@ -240,84 +244,98 @@ def sensors(count: int, **more: Any) -> tuple[Sensor, ...]:
     return tuple(out)
 
 
-def _changed(which: int, count: int, **more: Any) -> tuple[Sensor, ...]:
-    return tuple(replace(one, **more) if k == which else one for k, one in enumerate(sensors(count)))
+def _one(wrong: Wrong, count: int = 3, **more: Any) -> Scene:
+    return Scene(sensors(count), random_walks(10), {"s1": wrong}, **more)
 
 
-def _one(wrong: Wrong, count: int = 3, targets: int = 10, **more: Any) -> Scene:
-    return Scene(sensors(count, **more.pop("kind", {})), random_walks(targets), {"s1": wrong}, **more)
-
-
-def _catalogue() -> dict[str, Scene]:
-    ten, rates = random_walks(10), sensors(3)
-    rates = tuple(
-        replace(one, period=p, latency=late) for one, p, late in zip(rates, (1.0, 2.0, 4.0), (0.1, 0.4, 1.2), strict=True)
-    )
-    far = {"s0": range(8), "s1": range(4, 12), "s2": range(8, 16)}
+def _sound() -> dict[str, Scene]:
+    """Nothing is wrong."""
+    ten, three = random_walks(10), sensors(3)
+    slower = zip(three, (1.0, 2.0, 4.0), (0.1, 0.4, 1.2), strict=True)
+    rates = tuple(replace(one, period=period, latency=late) for one, period, late in slower)
+    fine = tuple(replace(one, sigma=one.sigma / 3, q=0.05, speed=20.0) for one in three)
+    precise = (replace(three[0], sigma=1.5), *three[1:])
+    overlap = {"s0": range(8), "s1": range(4, 12), "s2": range(8, 16)}
     correlated = {"rule": "auto", "rule_options": {"max_correlation": {"within": 1.0, "between": 0.5}}}
-    kinds: dict[str, Fault] = {
-        "clock .2 s": Fault(clock=0.2), "clock .5 s": Fault(clock=0.5), "clock 3 s": Fault(clock=3.0), "clock -3 s": Fault(clock=-3.0), "clock 1.5 s": Fault(clock=1.5),
-        "shift 50 m": Fault(x=30.0, y=40.0), "shift 200 m": Fault(x=120.0, y=-160.0),
-        "heading .3 deg": Fault(heading=0.3), "heading 1 deg": Fault(heading=1.0), "range 100 m": Fault(range=100.0),
-        "sigma x 1/3": Fault(sigma=1 / 3), "sigma x 1/10": Fault(sigma=0.1), "sigma x 3": Fault(sigma=3.0),
-    }  # fmt: skip
-    polar = {"sources": {"s1": {"polar": True}}}
-    stuck = Wrong(Fault(stuck=40.0))
-    scenes = {
+    return {
         "sound 2": Scene(sensors(2), ten),
-        "sound 3": Scene(sensors(3), ten),
+        "sound 3": Scene(three, ten),
         "sound 5": Scene(sensors(5), ten),
         "sound 20": Scene(sensors(20), random_walks(6), seconds=60.0),
-        "sound 3, one target": Scene(sensors(3), random_walks(1)),
+        "sound 3, one target": Scene(three, random_walks(1)),
         "sound 2, one target": Scene(sensors(2), random_walks(1)),
-        "sound 3, 40 targets": Scene(sensors(3), random_walks(40), seconds=60.0),
-        "sound 3, white": Scene(sensors(3), ten, white=True),
+        "sound 3, 40 targets": Scene(three, random_walks(40), seconds=60.0),
+        "sound 3, white": Scene(three, ten, white=True),
         "sound 2, white": Scene(sensors(2), ten, white=True),
-        "convoy": Scene(_fine(3), convoy(8, 100.0), near=50.0),
-        "one direction": Scene(sensors(3), random_walks(10, course=0.5)),
-        "stationary": Scene(sensors(3), random_walks(10, q=1e-4, speed=0.0)),
+        "convoy": Scene(fine, convoy(8, 100.0), near=50.0),
+        "one direction": Scene(three, random_walks(10, course=0.5)),
+        "stationary": Scene(three, random_walks(10, q=1e-4, speed=0.0)),
         "turning": Scene(sensors(3, q=10.0), turning(10)),
         "turning, q too small": Scene(sensors(3, q=1.0), turning(10)),
         "rates, latencies": Scene(rates, ten),
-        "partial overlap": Scene(sensors(3), random_walks(16), seen=far),
-        "one 10 x as precise": Scene(_changed(0, 3, sigma=1.5), ten),
-        "declared correlation": Scene(sensors(3), ten, config=correlated),
-        "clutter": Scene(sensors(3), ten, clutter=10.0),
+        "partial overlap": Scene(three, random_walks(16), seen=overlap),
+        "one 10 x as precise": Scene(precise, ten),
+        "declared correlation": Scene(three, ten, config=correlated),
+        "clutter": Scene(three, ten, clutter=3.0),
     }
-    scenes |= {name: _one(Wrong(fault)) for name, fault in kinds.items()}
-    scenes["range 100 m, polar"] = _one(Wrong(Fault(range=100.0)), config=polar)
-    scenes |= {
+
+
+def _alone() -> dict[str, Scene]:
+    """One of three is wrong, in one way or in two."""
+    faults = {
+        "clock .2 s": Fault(clock=0.2),
+        "clock .5 s": Fault(clock=0.5),
+        "clock 1.5 s": Fault(clock=1.5),
+        "clock 3 s": Fault(clock=3.0),
+        "clock -3 s": Fault(clock=-3.0),
+        "shift 50 m": Fault(x=30.0, y=40.0),
+        "shift 200 m": Fault(x=120.0, y=-160.0),
+        "heading .3 deg": Fault(heading=0.3),
+        "heading 1 deg": Fault(heading=1.0),
+        "range 100 m": Fault(range=100.0),
+        "sigma x 1/3": Fault(sigma=1 / 3),
+        "sigma x 1/10": Fault(sigma=0.1),
+        "sigma x 3": Fault(sigma=3.0),
+        "clock .5 s + shift 50 m": Fault(clock=0.5, x=30.0, y=40.0),
+        "shift 200 m + sigma 1/3": Fault(x=200.0, sigma=1 / 3),
+    }
+    covered = {"range": 60e3, "detection": 0.95}
+    return {name: _one(Wrong(fault)) for name, fault in faults.items()} | {
+        "range 100 m, polar": _one(Wrong(Fault(range=100.0)), config={"sources": {"s1": {"polar": True}}}),
         "deviations": _one(Wrong(deviations=True)),
-        "frozen": _one(stuck),
-        "ghosts": _one(Wrong(ghosts=4), kind={"range": 60e3, "detection": 0.95}),
-        "copy": Scene(sensors(4), ten, copies={"s3": "s0"}),
+        "frozen": _one(Wrong(frozen=40.0)),
+        "ghosts": replace(_one(Wrong(ghosts=4)), sensors=sensors(3, **covered)),
+        "copy": Scene(sensors(4), random_walks(10), copies={"s3": "s0"}),
         "drift 10 ms/s": _one(Wrong(later=lambda t: Fault(clock=0.01 * t))),
         "restart": _one(Wrong(restart=60.0)),
-        "shift 200 m, 100 to 200 s": _one(Wrong(Fault(x=200.0), begin=100.0, end=200.0), seconds=300.0),
-        "clock .5 s, 100 to 200 s": _one(Wrong(Fault(clock=0.5), begin=100.0, end=200.0), seconds=300.0),
-        "sigma x 1/3, 100 to 200 s": _one(Wrong(Fault(sigma=1 / 3), begin=100.0, end=200.0), seconds=300.0),
-        "clock .5 s + shift 50 m": _one(Wrong(Fault(clock=0.5, x=30.0, y=40.0))),
-        "shift 200 m + sigma 1/3": _one(Wrong(Fault(x=200.0, sigma=1 / 3))),
-        "two: clock .5, sigma 1/3": Scene(
-            sensors(5), ten, {"s1": Wrong(Fault(clock=0.5)), "s3": Wrong(Fault(sigma=1 / 3))}
-        ),
-        "two of 5 shifted alike": Scene(sensors(5), ten, {"s1": Wrong(Fault(x=200.0)), "s3": Wrong(Fault(x=200.0))}),
-        "two of 5 with ghosts": Scene(
-            sensors(5, range=60e3, detection=0.95), ten, {"s1": Wrong(ghosts=3), "s3": Wrong(ghosts=3)}
-        ),
-        "2: clock .5 s": _one(Wrong(Fault(clock=0.5)), count=2),
-        "2: shift 50 m": _one(Wrong(Fault(x=30.0, y=40.0)), count=2),
-        "2: shift 200 m": _one(Wrong(Fault(x=200.0)), count=2),
-        "2: sigma x 1/3": _one(Wrong(Fault(sigma=1 / 3)), count=2),
-        "2: sigma x 1/10": _one(Wrong(Fault(sigma=0.1)), count=2),
-        "2: sigma x 3": _one(Wrong(Fault(sigma=3.0)), count=2),
-        "2: frozen": _one(stuck, count=2),
+        **{
+            f"{name}, 100 to 200 s": _one(Wrong(faults[name], begin=100.0, end=200.0), seconds=300.0)
+            for name in ("shift 200 m", "clock .5 s", "sigma x 1/3")
+        },
     }
-    return scenes
 
 
-def _fine(count: int) -> tuple[Sensor, ...]:
-    return tuple(replace(one, sigma=one.sigma / 3, q=0.05, speed=20.0) for one in sensors(count))
+def _more() -> dict[str, Scene]:
+    """Two of five are wrong; one of two is."""
+    ten, five = random_walks(10), sensors(5)
+    shifted = Wrong(Fault(x=200.0))
+    faults = {
+        "clock .5 s": Wrong(Fault(clock=0.5)),
+        "shift 50 m": Wrong(Fault(x=30.0, y=40.0)),
+        "shift 200 m": shifted,
+        "sigma x 1/3": Wrong(Fault(sigma=1 / 3)),
+        "sigma x 1/10": Wrong(Fault(sigma=0.1)),
+        "sigma x 3": Wrong(Fault(sigma=3.0)),
+        "frozen": Wrong(frozen=40.0),
+    }
+    unlike = {"s1": faults["clock .5 s"], "s3": faults["sigma x 1/3"]}
+    ghosts = {"s1": Wrong(ghosts=3), "s3": Wrong(ghosts=3)}
+    return {
+        "two of 5: clock .5, sigma 1/3": Scene(five, ten, unlike),
+        "two of 5 shifted alike": Scene(five, ten, {"s1": shifted, "s3": shifted}),
+        "two of 5 with ghosts": Scene(sensors(5, range=60e3, detection=0.95), ten, ghosts),
+        **{f"2: {name}": _one(wrong, count=2) for name, wrong in faults.items()},
+    }
 
 
-WORLDS = _catalogue()
+WORLDS = _sound() | _alone() | _more()

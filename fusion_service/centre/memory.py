@@ -166,7 +166,8 @@ class Memory:
         states, bases, share, beside = run(base.take(some), which, operations, cut, time, self.motions)
         fresh = operations.row >= 0
         np.add.at(influence, operations.row[fresh], share[fresh])
-        self.watch.add_beside(names, operations.source[fresh], beside[:, fresh])
+        told = fresh & self._as_said(names)[operations.source]
+        self.watch.add_beside(names, operations.source[told], beside[:, told])
         tracks.used[filtered[at]] = tracks.time[filtered[at]]
         open_ = operations.take(operations.time > cut[which])
         self._keep(picture, bases, some, open_, ruled)
@@ -201,6 +202,10 @@ class Memory:
             np.zeros(len(some), dtype=np.bool_), versions.predicted_mean[:, some], found.vector[:, some] * scale,
             found.information[:, :, some] * scale, row,
         )  # fmt: skip
+
+    def _as_said(self, names: tuple[str, ...]) -> Bools:
+        """Of which sources the covariances are taken as they say: what is inflated agrees with anything."""
+        return np.array([self._intake.treatment(name).inflation == (1.0, 1.0) for name in names], dtype=np.bool_)
 
     def _inflation(self, name: str) -> float:
         said = self._intake.declared(self._intake.sources[name])

@@ -286,6 +286,10 @@ class Conduct:
         """What an alarm that stands says of a source; "" where none does."""
         return next(iter(self._warnings.of(name, but=REFUSED)), "")
 
+    def jumped(self, name: str, time: int) -> bool:
+        """Whether all its tracks jumped in the step at `time`, ns, and did not just before."""
+        return self._warnings.begun((name, "jump", "")) == time
+
     def stuck(self, name: str) -> str:
         """What an alarm says of a source that is stuck as a whole; "" where none stands."""
         return self._warnings.sentence((name, "stuck", ""))

@@ -7,7 +7,8 @@ more certain a source claims less and the farther it is from the median,
 
     w = (1 / sigma^2) s^2 / (s^2 + (theta - median)^2),
 
-so that of three or more the odd one out is the one that is found wrong. Of two nobody can tell: each gets its half of
+s^2 its variance, but not more than the middle one: what is far and hardly known does not pull. So
+that of three or more the odd one out is the one that is found wrong. Of two nobody can tell: each gets its half of
 the difference. An offset of all ranges is no such freedom, and is not kept.
 """
 
@@ -18,7 +19,7 @@ import numpy as np
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.supervision.bias import PARAMETERS, RANGE
 
-__all__ = ["SHARED", "connected", "gauge", "gauge_weights", "gauge_words"]
+__all__ = ["SHARED", "connected", "gauge", "gauge_weights", "gauge_words", "halved"]
 
 SHARED = 0.5
 """Shared targets, faded, from which two sources are connected."""
@@ -51,7 +52,8 @@ def gauge_weights(sigma: Floats, label: Ints, mean: Floats, variance: Floats) ->
             some = mine[sigma[mine, parameter] > 0]
             if len(some) > 2:
                 off = mean[some, parameter] - np.median(mean[some, parameter])
-                spread = variance[some, parameter] + (FLOOR * sigma[some, parameter]) ** 2
+                usual = np.minimum(variance[some, parameter], np.median(variance[some, parameter]))
+                spread = usual + (FLOOR * sigma[some, parameter]) ** 2
                 weight[some, parameter] = spread / (spread + off**2)
     return weight
 
@@ -71,6 +73,13 @@ def gauge(sigma: Floats, label: Ints, reference: Bools, weights: Floats) -> Floa
             row[some, parameter] = weights[some, parameter] / sigma[some, parameter]
             rows.append(row / np.sqrt((row**2).sum()))
     return np.stack(rows) if rows else np.zeros((0, *sigma.shape))
+
+
+def halved(label: Ints, reference: Bools, at: int) -> bool:
+    """Whether the source `at` is measured by the middle between it and one other: as far as it is off that, it may be
+    right."""
+    mine = label == label[at]
+    return int(mine.sum()) == 2 and not reference[mine].any()
 
 
 def gauge_words(names: tuple[str, ...], at: int, label: Ints, reference: Bools) -> str:

@@ -107,7 +107,7 @@ def _block(pairs: Pairs, mine: Ints, value: Floats) -> tuple[Floats, Floats, Flo
     columns = np.arange(len(w))
     A[i, columns] += p
     A[j, columns] += q
-    M, b = _normal(A, w, pairs.scale - fixed)
+    M, b = _normal(A, w, pairs.scale - fixed, pairs.scale)
     a, inverse = _above_zero(M, b)
     gain = total((inverse[:, :, None] * (A * w)[None]).swapaxes(0, 1))
     null = np.maximum(np.minimum(A + total(A * a[:, None]) - A * a[:, None] + fixed, pairs.scale), LEAST)
@@ -122,13 +122,16 @@ def _block(pairs: Pairs, mine: Ints, value: Floats) -> tuple[Floats, Floats, Flo
     return a, np.sqrt(variance + shared), freedom
 
 
-def _normal(A: Floats, w: Floats, s: Floats) -> tuple[Floats, Floats]:
-    """M (m, m) and b (m,) of M a = b, the prior included."""
+def _normal(A: Floats, w: Floats, s: Floats, scale: Floats) -> tuple[Floats, Floats]:
+    """M (m, m) and b (m,) of M a = b, the prior included, which is the weaker the larger the least `scale` (K,) of a
+    source's pairs is: a factor of 100 is not held back by it, and a sound source beside one with that factor is."""
     weighted = A * w
     M = np.add.reduce(weighted[:, None] * A[None], axis=2)
     b = np.add.reduce(weighted * s, axis=1)
     weight = np.add.reduce(w * (A > 0.0), axis=1)
-    prior = np.diagonal(M) / np.maximum(weight, 1e-300) / PRIOR**2
+    least = np.where(A > 0.0, scale, np.inf).min(axis=1, initial=np.inf)
+    least = np.where(np.isfinite(least), np.maximum(least, 1.0), 1.0)
+    prior = np.diagonal(M) / np.maximum(weight, 1e-300) / (PRIOR * least) ** 2
     prior = np.where(prior > 0.0, prior, 1.0)
     M[range(len(M)), range(len(M))] += prior
     return M, b + prior

@@ -40,6 +40,12 @@ MOST_SOURCE_PAIRS = 4096
 MOST_NAMES = 2000
 FEW = 3.0
 """Independent differences without which nothing is said of a pair."""
+EXPLAINED = 0.05
+"""Part of the scale of a pair's differences, from which a change of a correction makes them others."""
+RECENT = 5.0
+"""Steps that the recent mean is about."""
+MENDED, FORGOTTEN = 0.4, 0.8
+"""Part of a scale, below which the recent mean says that it is no more, and what is kept then, of what was before."""
 MATTERS = 1.25
 """A factor on variances below which nothing is said, though it may be no chance."""
 CONSTANT = 0.5
@@ -137,7 +143,8 @@ class Honesty:
             for b, w in ((below, 1 - part), (below + 1, part))
         ]
         sums.histogram[:, block] = kept[:, None] * (sums.histogram[:, block] + (flat[0] + flat[1]).reshape(K, BINS))
-        cut = CUT * 2.0 * robust_scale(sums.histogram[:, block], k)[pair]
+        scale = robust_scale(sums.histogram[:, block], k)
+        cut = CUT * 2.0 * scale[pair]
         product, both = total(u * last) / k, 0.5 * (square + total(last * last) / k)
         usual = np.isfinite(both) & (square < cut) & (both < cut)
         more = (
@@ -151,12 +158,28 @@ class Honesty:
         for name, new in more:
             column = getattr(sums, name)
             column[:, block] = kept * (column[:, block] + new)
+        self._mended(block, scale, count, np.bincount(pair, np.minimum(square, cut), K))
         if difference is None:
             return
         usual = square < cut
         for axis, r in enumerate(difference[:3, good][:, usual]):
             for column, value in ((sums.offset, r), (sums.squared, r * r)):
                 column[:, axis] = kept * (column[:, axis] + np.bincount(pair[usual], weights=value, minlength=K))
+
+    def _mended(self, block: int, scale: Floats, count: Floats, square: Floats) -> None:
+        """Forget soon what is no more: of pairs (K,) whose differences, `count` new ones with the sum `square`, have
+        become far smaller than their `scale` says. What has been mended is to be seen before it fades by itself."""
+        sums, there = self._sums, count > 0
+        mean = square / np.maximum(count, 1.0)
+        recent = sums.recent[:, block]
+        begun = np.where(sums.updates[:, block] > 1.0, recent + (mean - recent) / RECENT, mean)
+        sums.recent[:, block] = np.where(there, begun, recent)
+        gone = np.flatnonzero(there & (scale > 1.0 / MENDED) & (sums.recent[:, block] < MENDED * scale))
+        for name in ("histogram", "weight", "share", "updates", "moved", "square", "moves"):
+            getattr(sums, name)[gone, block] *= FORGOTTEN
+        if block == 0:
+            for column in (sums.offset, sums.squared):
+                column[gone] *= FORGOTTEN
 
     def _numbers(self, names: tuple[str, ...]) -> Ints:
         """The number that each source has here."""
@@ -214,8 +237,9 @@ class Honesty:
             pairs, sure = _with_innovations(pairs, S, self._innovations(own), z)
             found = solved(pairs, self._factors[block])
             self._factors[block] = found.value
-            wrong[block] = sure & _beyond(found, z)
             suspect = _pair_beyond(pairs, z) & (pairs.first != pairs.second)
+            sure = sure & ~_unexplained(pairs, found.value, suspect)
+            wrong[block] = sure & _beyond(found, z)
             for side in (pairs.first, pairs.second):
                 np.maximum.at(doubted[block], side[suspect], pairs.scale[suspect])
             doubted[block, sure] = 1.0
@@ -269,6 +293,19 @@ class Honesty:
     def _innovations(self, own: Innovations) -> list[tuple[int, float, float]]:
         place = {name: i for i, name in enumerate(self._names)}
         return [(place[name], *value) for name, value in sorted(own.items()) if name in place]
+
+    def forget(self, size: Mapping[str, float]) -> None:
+        """What these sources say is from now on another thing: it is corrected, or no more. size: mean square of what
+        has changed, beside the errors that it says; pairs of which that is little of their differences are kept."""
+        sums = self._sums
+        by_number = np.array([size.get(name, 0.0) for name in self._names])
+        weight = sums.weight[:, 0]
+        share = np.clip(sums.share[:, 0] / np.where(weight > 0.0, weight, 1.0), 0.0, 1.0)
+        first, second = sums.key // BASE, sums.key % BASE
+        with np.errstate(invalid="ignore"):
+            part = np.fmax(by_number[first] * share, by_number[second] * (1.0 - share))
+        scale = robust_scale(sums.histogram[:, 0], max(len(self._blocks[0]), 1))
+        self._sums = sums.take(part <= EXPLAINED * scale)
 
     def rebase(self) -> None:
         """A new era begins: tracks of before are not compared with those of after."""
@@ -333,6 +370,17 @@ def _beyond(found: Factors, z: float) -> Bools:
     freedom = np.maximum(found.freedom, 0.2)
     skewed = (high_bound(freedom, z) - 1.0) / np.sqrt(2.0 / freedom)
     return np.asarray((found.value > MATTERS) & (found.value - 1.0 > np.maximum(skewed, z) * found.sigma))
+
+
+def _unexplained(pairs: Pairs, value: Floats, suspect: Bools) -> Bools:
+    """Which sources (S,) of `suspect` pairs differ from the other by more than the factors `value` (S,) explain, where
+    these are known by innovations only: an offset of place or clock is in none, and which of two has it is not known
+    from them."""
+    explained = value[pairs.first] * pairs.share + value[pairs.second] * (1.0 - pairs.share)
+    some = suspect & (pairs.scale > MATTERS * explained)
+    S, real = len(value), pairs.first != pairs.second
+    alone = ~decidable(pairs.take(real), S)
+    return alone & np.isin(np.arange(S), np.concatenate([pairs.first[some], pairs.second[some]]))
 
 
 def _pair_beyond(pairs: Pairs, z: float) -> Bools:

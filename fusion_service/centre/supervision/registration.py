@@ -27,7 +27,7 @@ from fusion_service.centre.supervision.bias import CLOCK, DRIFT, PARAMETERS, pri
 from fusion_service.centre.supervision.comparing import Compared, Treated, chosen_rows, compared, labels
 from fusion_service.centre.supervision.correction import Bias
 from fusion_service.centre.supervision.estimate import Information, Posterior
-from fusion_service.centre.supervision.gauge import connected, gauge, gauge_weights, gauge_words
+from fusion_service.centre.supervision.gauge import connected, gauge, gauge_weights, gauge_words, halved
 from fusion_service.centre.supervision.lasting import Lasting, robust
 from fusion_service.centre.supervision.shared import Shared
 from fusion_service.centre.supervision.unlinked import Unlinked
@@ -139,6 +139,15 @@ class Registration:
                 self._restarted(at)
         self._epochs = {name: self._intake.sources[name].epoch for name in new}
         return np.array([new.index(name) if name in new else -1 for name in names], dtype=np.intp)
+
+    def forget(self, name: str) -> None:
+        """All that a source says has jumped: its errors are other ones."""
+        if name in self._information.names:
+            at = self._information.names.index(name)
+            self._information.forget(at, np.ones(P, dtype=np.bool_))
+            self._lasting.forget(at)
+            self._applied[name] = Applied()
+            self._estimate(self._how().site)
 
     def _restarted(self, at: int) -> None:
         """Its clock may be another; its place and heading are what they were."""
@@ -254,6 +263,9 @@ class Registration:
         for at, name in enumerate(self._information.names):
             told, before = self._told(at), self._applied.get(name, Applied())
             after, what = decide(before, told, self._effect[at], self._intake.config.supervision_errors, corrects)
+            if after.on and halved(self._known.label, self._known.reference, at):  # which half of it is right?
+                both = after.covariance + np.outer(after.value, after.value)
+                after = replace(after, covariance=both, loose=True)
             self._applied[name] = after
             if what:
                 words = telling.note(told, after.on, after.found, corrects)
@@ -269,6 +281,20 @@ class Registration:
         site = self._known.sites[:, self._information.names.index(name)]
         bias = Bias(self._intake.config.space, site, applied.value, applied.covariance, applied.loose)
         return round(applied.value[CLOCK] * 1e9), bias
+
+    def same(self) -> dict[int, int]:
+        """{global track: the older one that it is the same target as}, though nothing links them."""
+        return self._unlinked.same()
+
+    def told(self, name: str) -> tuple[bool, bytes]:
+        """Whether anything is taken off a source, and what the last event said of it."""
+        applied = self._applied.get(name, Applied())
+        return applied.on, applied.told.tobytes()
+
+    def size(self, name: str) -> float:
+        """Mean square of the error of a source beside those that its tracks have of their own."""
+        names = self._information.names
+        return float(self._effect[names.index(name), 0]) if name in names else 0.0
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""

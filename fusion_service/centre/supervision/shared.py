@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_service.arrays import Ints
 from fusion_service.centre.association import by_size
@@ -30,18 +31,19 @@ class Shared:
         return len(self.first)
 
 
-def shared_pairs(rows: Rows, step: int) -> Shared:
+def shared_pairs(rows: Rows, step: int, label: NDArray[np.uint64] | None = None) -> Shared:
     """The pairs of a step; of more than about `MOST_PAIRS` those of the global tracks that it is the turn of in this
-    `step`."""
-    linked = np.flatnonzero(rows.tracks.link != NO_TRACK)
-    size = np.unique(rows.tracks.link[linked], return_counts=True)[1]
+    `step`. label (M,): the target of each row, where it is another than its link says; 0: none."""
+    target = rows.tracks.link if label is None else label
+    linked = np.flatnonzero(target != NO_TRACK)
+    size = np.unique(target[linked], return_counts=True)[1]
     every = 1
     while every * MOST_PAIRS < int((size * (size - 1) // 2).sum()):
         every *= 2
-    turn = (rows.tracks.link[linked] + np.uint64(step // TURN)) % np.uint64(every) == 0
+    turn = (target[linked] + np.uint64(step // TURN)) % np.uint64(every) == 0
     linked = linked[turn]
     first, second = [np.zeros(0, dtype=np.intp)], [np.zeros(0, dtype=np.intp)]
-    for _, members in by_size(rows.tracks.link[linked]):
+    for _, members in by_size(target[linked]):
         i, j = np.triu_indices(members.shape[1], 1)
         first.append(linked[members[:, i]].ravel())
         second.append(linked[members[:, j]].ravel())

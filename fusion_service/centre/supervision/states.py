@@ -147,9 +147,9 @@ def _followed(applied: tuple[float, float], opinion: Opinion, goes_on: bool) -> 
     """The factors to be applied, where `applied` were."""
     if not opinion.decided:
         return 1.0, 1.0
-    new = []
-    for old, wrong, value in zip(applied, opinion.wrong, opinion.estimate, strict=True):
-        found = max(value, 1.0) if wrong or (goes_on and old > 1.0) else 1.0
+    new, either = [], any(opinion.wrong)  # what is wrong in one is seldom right in the other, if less surely so
+    for old, value in zip(applied, opinion.estimate, strict=True):
+        found = max(value, 1.0) if either or (goes_on and old > 1.0) else 1.0
         found = min(found, FARTHEST)
         new.append(old if goes_on and old / STEP < found < old * STEP else found)
     return new[0], new[1]

@@ -12,10 +12,11 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
+from fusion_service.centre.supervision.comparing import labels
 from fusion_service.centre.supervision.conduct import Conduct
 from fusion_service.centre.supervision.honesty import Honesty, Innovations, Opinion
 from fusion_service.centre.supervision.registration import Registration
-from fusion_service.centre.supervision.shared import shared_pairs
+from fusion_service.centre.supervision.shared import Shared, shared_pairs
 from fusion_service.centre.supervision.states import States
 from fusion_service.centre.supervision.traffic import Traffic
 from fusion_service.centre.treatment import Treatment
@@ -54,18 +55,39 @@ class Supervisor:
         """Learn from a step, its links decided and nothing fused yet, and settle how sources are treated in the next.
         now: the picture predicted to `time`, ns; own: what is known of the sources' own innovations."""
         self.conduct.observe(rows, names, time, journal)
+        jumped = {name for name in names if self.conduct.jumped(name, time)}
+        for name in sorted(jumped):
+            self.registration.forget(name)
         shared = shared_pairs(rows, step)
+        before = [self.registration.told(name) for name in names]
         self.registration.observe(rows, names, now, shared, time, journal)
         if self._config.supervision != "off":
             self.traffic.observe(rows, names, now, self._intake, time)
             if self._frame != self._intake.frame:
                 self._honesty.rebase()
                 self._frame = self._intake.frame
-            self._honesty.observe(rows, names, shared, self._applied(names))
+            self._honesty.observe(rows, names, self._beside(rows, shared, step), self._applied(names))
             self._opinions = self._honesty.opinions(self._chance(time), own or {})
             for event in self.states.settle(names, self._opinions, self._orders(), self._stuck(names), time):
                 journal.event(event)
+            if changed := self._otherwise(names, before) | dict.fromkeys(jumped, np.inf):
+                self._honesty.forget(changed)
         self._treat(names)
+
+    def _beside(self, rows: Rows, shared: Shared, step: int) -> Shared:
+        """The pairs that are compared: where errors of clock and place are told only, also those of targets that these
+        are too large for any link of. Unsure of itself by that much, a source is linked and shows nothing twice."""
+        same = self.registration.same() if self._config.registration == "estimate" else {}
+        return shared_pairs(rows, step, labels(rows, same)) if same else shared
+
+    def _otherwise(self, names: tuple[str, ...], before: list[tuple[bool, bytes]]) -> dict[str, float]:
+        """The sources of which other errors are taken off from now on than `before`, and how large they are."""
+        now = [self.registration.told(name) for name in names]
+        return {
+            name: self.registration.size(name)
+            for name, was, one in zip(names, before, now, strict=True)
+            if was != one and (was[0] or one[0])
+        }
 
     def _applied(self, names: tuple[str, ...]) -> Floats:
         """By what (2, S) the covariances of the sources are multiplied in this step."""

@@ -65,6 +65,11 @@ class Warnings:
         ]
         return [sentence for _, _, sentence in sorted(mine)[:SHOWN]]
 
+    def begun(self, key: Key) -> int:
+        """Since when one of them stands, ns; -1 where it does not."""
+        one = self._standing.get(key)
+        return -1 if one is None else one.since
+
     def sentence(self, key: Key) -> str:
         """What one of them says; "" where it does not stand."""
         one = self._standing.get(key)
