@@ -12,7 +12,8 @@ rule `auto`, scored as `fusion-service evaluate` does (GOSPA, c = 20 m, every se
 * with --perturb K, every tuned number of both trackers times a factor of its own between 1/1.3 and 1.3, K times
   (`autoferry_local`): median and worst of the means and of each scenario, and in each scenario the distance to the
   best single sensor of the same setting;
-* with --latencies, the sensors' latencies, s, instead of those fitted to the truth.
+* with --latencies, the sensors' latencies, s, instead of those fitted to the truth; with --set, another setting of the
+  centre, as registration=correct.
 """
 
 from __future__ import annotations
@@ -20,15 +21,17 @@ from __future__ import annotations
 import argparse
 import sys
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.autoferry_local import FACTOR, SCENARIOS, messages, perturbed
+from fusion_service.config.settings import change, merge
 from fusion_service.demo import AUTOFERRY
 from fusion_service.process import data_folder
 from fusion_service.review.evaluation import METRICS, evaluate
@@ -42,24 +45,34 @@ Pair: TypeAlias = tuple[HarbourSensor, HarbourSensor]
 NAMES = ("lidar", "radar", "fused")
 
 
+@lru_cache
+def scans_of(directory: Path, number: int, sensor_id: int) -> list[autoferry.Scan]:
+    return autoferry.read_scans(directory / f"scenario{number}_detections.json", sensor_id)
+
+
+@lru_cache
+def truth_of(directory: Path, number: int) -> tuple[Message, ...]:
+    return tuple(messages("truth", autoferry.load(directory, number).truth()))
+
+
 def spoken(directory: Path, number: int, sensors: Pair) -> list[Message]:
     """What the sensors say in a scenario, in the order of time."""
     said: list[Message] = []
     for sensor in sensors:
-        scans = autoferry.read_scans(directory / f"scenario{number}_detections.json", sensor.sensor_id)
+        scans = scans_of(directory, number, sensor.sensor_id)
         said += messages(sensor.name, autoferry.sensor_events(sensor, scans))
     return sorted(said, key=lambda message: message.sent)
 
 
-def scores(directory: Path, sensors: Pair, note: str = "") -> Floats:
+def scores(directory: Path, sensors: Pair, note: str = "", settings: Mapping[str, Any] | None = None) -> Floats:
     """METRICS (5, 3, 7) of lidar, radar and fused in every scenario."""
     rows = []
     for number in SCENARIOS:
         print(f"\r{note} scenario {number}   ", end="", file=sys.stderr, flush=True)
         said = spoken(directory, number, sensors)
-        pictures = missions.fuse(said, {**tomllib.loads(AUTOFERRY), "rule": "auto"})  # type: ignore[arg-type]
-        truth = messages("truth", autoferry.load(directory, number).truth())
-        result = evaluate([*said, *truth, *pictures], c=20.0, every=1.0)
+        config = {**tomllib.loads(AUTOFERRY), "rule": "auto", **(settings or {})}
+        pictures = missions.fuse(said, config)  # type: ignore[arg-type]
+        result = evaluate([*said, *truth_of(directory, number), *pictures], c=20.0, every=1.0)
         found = [*(result.sources[name] for name in NAMES[:2]), result.fused]
         rows.append([[float(getattr(one, metric) or 0.0) for metric in METRICS] for one in found])
     print("\r" + " " * 60 + "\r", end="", file=sys.stderr)
@@ -181,6 +194,7 @@ def main() -> int:
     parser.add_argument("--perturb", type=int, default=0, metavar="K", help="also score K changed settings")
     parser.add_argument("--without", nargs="*", choices=[*PARTS, "each"], default=[], help="parts of the model")
     parser.add_argument("--latencies", nargs=2, type=float, metavar=("LIDAR", "RADAR"), help="s, instead of the fitted")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre")
     arguments = parser.parse_args()
     directory = data_folder("autoferry", arguments.data)
     if directory is None:
@@ -191,7 +205,10 @@ def main() -> int:
             replace(LIDAR, latency=arguments.latencies[0]),
             replace(RADAR, latency=arguments.latencies[1]),
         )
-    whole = scores(directory, sensors)
+    settings: dict[str, Any] = {}
+    for text in arguments.set:
+        merge(settings, change(text))
+    whole = scores(directory, sensors, settings=settings)
     show(whole)
     if arguments.without:
         ablate(directory, whole, PARTS if "each" in arguments.without else arguments.without)

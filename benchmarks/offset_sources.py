@@ -26,7 +26,7 @@ class Offset:
     """A source: where it stands, m; its errors (s, m, m, rad, m, 1; as `bias` has them); sigma of places and
     velocities; lasting: correlation of successive errors of a track; tracker: its tracks are those of Kalman filters,
     of detections each second with the sigma of places; drift of its clock, s/s; claims: what it
-    says of its sigmas, as a share of them."""
+    says of its sigmas, as a share of them; way: how fast it moves itself, m/s, and then says where it is."""
 
     place: tuple[float, float] = (0.0, 0.0)
     clock: float = 0.0
@@ -41,13 +41,19 @@ class Offset:
     polar: bool = False
     tracker: bool = False
     claims: float = 1.0
+    way: tuple[float, float] | None = None
 
-    def says(self, states: Floats) -> Floats:
+    def at(self, second: float) -> Floats:
+        """Where it is (2,), m."""
+        return np.array(self.place) + second * np.array(self.way or (0.0, 0.0))
+
+    def says(self, states: Floats, second: float = 0.0) -> Floats:
         """What it says of true states (T, 4), written down anew from the geometry: polar coordinates about it."""
-        d = states[:, :2] - np.array(self.place)
+        at = self.at(second)
+        d = states[:, :2] - at
         r, a = np.hypot(*d.T), np.arctan2(d[:, 1], d[:, 0])
         r, a = r * (1 + self.scale) + self.range, a + self.heading
-        place = np.array(self.place) + np.stack([r * np.cos(a), r * np.sin(a)], axis=1) + [self.x, self.y]
+        place = at + np.stack([r * np.cos(a), r * np.sin(a)], axis=1) + [self.x, self.y]
         speed, course = np.hypot(*states[:, 2:].T), np.arctan2(states[:, 3], states[:, 2]) + self.heading
         return np.concatenate([place, np.stack([speed * np.cos(course), speed * np.sin(course)], axis=1)], axis=1)
 
@@ -109,7 +115,7 @@ class World:
             a = one.lasting
             self.errors[name] = a * self.errors[name] + np.sqrt(1 - a * a) * self._error(one)
             clock = one.clock + one.drift * self.second
-            says = one.says(self.truth(self.second - clock)) + self.errors[name]
+            says = one.says(self.truth(self.second - clock), self.second) + self.errors[name]
             spread = np.diag(np.repeat(one.sigma, 2) ** 2) * one.claims**2
             if one.tracker:
                 says, spread = self._tracked(name, says)
@@ -118,6 +124,7 @@ class World:
                 source=name, epoch=self.epoch[name], seq=self.second, sent=START, time=START + self.second * SECOND,
                 complete=True, space=SPACE, frame=FRAME, ids=np.array(some, dtype=np.uint64) + np.uint64(1),
                 means=says[some], covariances=np.tile(spread, (len(some), 1, 1)),
+                platform=None if one.way is None else schemas.Platform((*one.at(self.second).tolist(), 0.0)),
             )  # fmt: skip
             self.centre.handle(message, START + self.second * SECOND + SECOND // 10)
         return self.centre.step(START + self.second * SECOND)

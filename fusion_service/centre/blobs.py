@@ -1,9 +1,10 @@
 """Rows that stand for two objects for a while: a lidar that sees two boats side by side as one.
 
 A source that had a row in each of two global tracks at a time, and now has one in the first only, has perhaps lost
-the second, or its one row now stands for both. The latter is believed where that row still covers the second track: d2
-in the plane within the gate, shapes and reference points allowed for. For as long as it does (`HOLD` at most, or while
-another source has a row in each of the two: that one tells them apart), the row supports both tracks:
+the second, or its one row now stands for both (not if it has both rows still, in other tracks). The latter is believed
+where that row still covers the second track: d2 in the plane within the gate, shapes and reference points allowed for.
+For as long as it does (`HOLD` at most, or while another source has a row in each of the two: that one tells them
+apart), the row supports both tracks:
 
 * the second is not counted as missed by that source, nor as dropped: where nobody else follows it, it coasts;
 * where the source says that its rows may be blobs (`reference`), it is supported as long as they cover it;
@@ -43,6 +44,10 @@ NEIGHBOURS = 4
 """Tracks near one that is missed whose rows may cover it, the nearest."""
 MOST = 200_000
 """Links remembered."""
+CHAIN = 3
+"""Rows in turn that take each other's places at most."""
+TRIFLE = 1e-12
+"""By which what a row may be off is larger: its own error may be less than what is lost in rounding."""
 
 Ids = NDArray[np.uint64]
 
@@ -147,6 +152,7 @@ class Shared:
         more = np.zeros((3, len(rows.source)))
         for part, product in zip(more, (x * x, x * y, y * y), strict=True):
             np.add.at(part, row, product)
+        more[[0, 2]] *= 1.0 + TRIFLE
         column = column.copy()
         column[8:11, row] = more[:, row]
         tracks = widened(replace(rows.tracks, extent=column), more, self._space, self._frame)
@@ -178,10 +184,13 @@ class Shared:
 
 
 class _Links(NamedTuple):
-    """K links of a source (its place in the sorted names) to a track, and when each began and was last there, ns."""
+    """K links of a source (its place in the sorted names) to a track, by the row with the id `local` (once it is lost:
+    the row that went, which is another one if that took this one's place), and when each began and was last there, ns.
+    """
 
     source: Ints
     track: Ids
+    local: Ids
     since: NDArray[np.int64]
     time: NDArray[np.int64]
 
@@ -190,7 +199,7 @@ class _Links(NamedTuple):
 
 
 WHOLE = np.zeros(0, dtype=np.int64)
-NO_LINKS = _Links(np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.uint64), WHOLE, WHOLE)
+NO_LINKS = _Links(np.zeros(0, dtype=np.intp), *2 * (np.zeros(0, dtype=np.uint64),), WHOLE, WHOLE)
 
 
 class Blobs:
@@ -207,14 +216,14 @@ class Blobs:
         """What rows stand for in the step at `time`, ns, when links are decided. now: the picture predicted to it."""
         shared = Shared(rows, now, self._config, frame)
         linked, was, lost = rows.linked(), self._followed, self._lost
-        source, track = rows.source[linked], rows.tracks.link[linked]
+        source, track, local = rows.source[linked], rows.tracks.link[linked], rows.tracks.id[linked]
         times = np.full(len(linked), time, dtype=np.int64)
         same = self._names == names and np.array_equal(was.track, track) and np.array_equal(was.source, source)
         if same:
-            links = _Links(source, track, was.since, times)
+            links = _Links(source, track, local, was.since, times)
         else:
-            lost = _renamed(lost, was, self._names, names)
-            links = _Links(source, track, _begun(source, track, lost, times), times)
+            lost = _renamed(lost, _vanished(was, self._names, names, source, track, local), self._names, names)
+            links = _Links(source, track, local, _begun(source, track, lost, times), times)
         self._names, self._followed, self._lost, self.unmerged = names, links, NO_LINKS, self.unmerged[:0]
         if len(lost.track) and len(now.id) > 1:
             self._share(shared, lost, now, time)
@@ -231,7 +240,7 @@ class Blobs:
         which, row = shared.covered(lost.source, at)
         begun = np.empty(len(shared.at), dtype=np.int64)
         begun[shared.at >= 0] = self._followed.since
-        both = begun[row] <= lost.time[which]
+        both = (begun[row] <= lost.time[which]) & ~self._alive(lost.take(which))
         which, row = which[both], row[both]
         young = time - lost.time <= round(HOLD * 1e9)
         apart = np.zeros(len(at), dtype=np.bool_)
@@ -241,6 +250,10 @@ class Blobs:
         self.unmerged = shared.pairs()
         kept = np.flatnonzero(young | apart)
         self._lost = lost.take(kept[np.argsort(-lost.time[kept], kind="stable")][:MOST])
+
+    def _alive(self, lost: _Links) -> Bools:
+        """Whether the source of these links (K,) has the row still that went when they were lost."""
+        return _found(lost.source, lost.local, self._followed.source, self._followed.local)[0]
 
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns: nothing is later."""
@@ -278,14 +291,37 @@ def _renamed(lost: _Links, was: _Links, before: tuple[str, ...], names: tuple[st
     return both._replace(source=here[both.source])
 
 
+def _vanished(
+    was: _Links, before: tuple[str, ...], names: tuple[str, ...], source: Ints, track: Ids, local: Ids
+) -> _Links:
+    """What was followed, by the rows that went: where a row goes on in a track that another one had, that other one.
+    source, track, local (L,): the links of now."""
+    place = {name: number for number, name in enumerate(names)}
+    mine = np.array([*(place.get(name, -1) for name in before), -1], dtype=np.intp)[was.source]
+    went = was.local
+    for _ in range(CHAIN):
+        goes_on, at = _found(mine, went, source, local)
+        had, whose = _found(mine[goes_on], track[at[goes_on]], mine, was.track)
+        some = np.flatnonzero(goes_on)[had]
+        went = went.copy()
+        went[some] = was.local[whose[had]]
+    return was._replace(local=went)
+
+
+def _found(source: Ints, key: Ids, sources: Ints, keys: Ids) -> tuple[Bools, Ints]:
+    """Which of the pairs (source, key) (K,) are among (sources, keys) (L,), and where."""
+    if not len(keys):
+        return np.zeros(len(key), dtype=np.bool_), np.zeros(len(key), dtype=np.intp)
+    ids, number = np.unique(np.concatenate([keys, key]), return_inverse=True)
+    had = (sources + 1) * len(ids) + number[: len(keys)]
+    order = np.argsort(had, kind="stable")
+    wanted = (source + 1) * len(ids) + number[len(keys) :]
+    at = order[np.minimum(np.searchsorted(had[order], wanted), len(had) - 1)]
+    return had[at] == wanted, at
+
+
 def _begun(source: Ints, track: Ids, known: _Links, times: NDArray[np.int64]) -> NDArray[np.int64]:
     """When each of these links began: as far back as it is known, else now."""
-    order = np.lexsort((known.since, known.track, known.source))
-    known = known.take(order)
-    ids, number = np.unique(np.concatenate([known.track, track]), return_inverse=True)
-    had = (known.source + 1) * len(ids) + number[: len(known.track)]
-    wanted = (source + 1) * len(ids) + number[len(known.track) :]
-    if not len(had):
-        return times
-    at = np.minimum(np.searchsorted(had, wanted), len(had) - 1)
-    return np.where(had[at] == wanted, known.since[at], times)
+    known = known.take(np.lexsort((known.since, known.track, known.source)))
+    there, at = _found(source, track, known.source, known.track)
+    return np.where(there, known.since[at], times) if len(known.since) else times

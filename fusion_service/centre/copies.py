@@ -173,7 +173,7 @@ class Copies:
             seen, last = self.pairs.get(key, (0, -1))
             seen += newest > last
             pairs[key] = seen, newest
-            if seen > FEW and not gone.keys() & set(key) and key[0] not in gone.values():
+            if seen > FEW and not (gone.keys() | set(gone.values())) & set(key):
                 gone[key[1]] = key[0]
                 journal.merge(key[0], key[1], float(distance[k]))
                 moved = np.flatnonzero(rows.tracks.link == np.uint64(key[1]))

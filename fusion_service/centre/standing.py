@@ -29,6 +29,7 @@ from schemas import Ecef, Frame, Platform
 __all__ = ["heading_sigma_of", "place_in", "place_of", "turned"]
 
 AXES = (("x", "y", "z"), ("vx", "vy", "vz"), ("ax", "ay", "az"))
+TRIFLE = 1e-12
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -91,11 +92,20 @@ def turned(tracks: Tracks, source: Source, space: tuple[str, ...], frame: Frame 
     unknown = Unknown.of(space)
     if not len(tracks.log_weight):
         more = _effect(tracks.mean, tracks.covariance, space, stand, unknown) * sigma
-        return replace(tracks, covariance=tracks.covariance + more[:, None] * more[None])
+        return replace(tracks, covariance=tracks.covariance + _square(more))
     more = _effect(tracks.part_mean, tracks.part_covariance, space, stand, unknown) * sigma
-    parts = tracks.part_covariance + more[:, None] * more[None]
+    parts = tracks.part_covariance + _square(more)
     mean, covariance = Mixtures(tracks.log_weight, tracks.part_mean, parts).moments()
     return replace(tracks, mean=mean, covariance=covariance, part_covariance=parts)
+
+
+def _square(more: Floats) -> Floats:
+    """Covariances (n, n, ...) of an error `more` (n, ...), on the diagonal by a trifle larger: what it is added to may
+    be less than what is lost in rounding."""
+    out: Floats = more[:, None] * more[None]
+    for k in range(len(more)):
+        out[k, k] *= 1.0 + TRIFLE
+    return out
 
 
 def _effect(mean: Floats, covariance: Floats, space: tuple[str, ...], stand: _Stand, unknown: Unknown) -> Floats:

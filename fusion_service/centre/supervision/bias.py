@@ -22,8 +22,8 @@ import numpy as np
 from fusion_service.arrays import Floats
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.sources import Source
+from fusion_service.centre.standing import place_in, place_of
 from fusion_service.centre.stated_registration import shift_of
-from fusion_service.geodesy import FrameError, transform
 
 __all__ = [
     "CLOCK",
@@ -64,15 +64,11 @@ def design(place: Floats, velocity: Floats, site: Floats) -> Floats:
 
 
 def site_of(intake: Intake, source: Source) -> Floats:
-    """Where a source stands (2,), m, in the picture's frame; the origin where it says nothing that can be used."""
-    info, frame = source.info, intake.frame
-    if info is None or frame is None:
-        return np.zeros(2)
-    try:
-        place, _ = transform(np.array([info.position], dtype=np.float64), np.zeros((1, 3, 3)), AXES, info.frame, frame)
-    except (FrameError, ValueError):
-        return np.zeros(2)
-    return place[0, :2].copy() if np.isfinite(place).all() else np.zeros(2)
+    """Where a source stands (2,), m, in the picture's frame: the platform of its newest tracks, else its info says; the
+    origin where there is nothing that can be used."""
+    place = place_of(source)
+    here = None if place is None or intake.frame is None else place_in(place, intake.frame)
+    return np.zeros(2) if here is None else here[:2].copy()
 
 
 def is_polar(intake: Intake, source: Source) -> bool:

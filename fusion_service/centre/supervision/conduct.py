@@ -94,6 +94,7 @@ class Conduct:
         if self._intake.config.supervision == "off":
             return
         self._records = {name: self._records.get(name, _Record()) for name in names}
+        self._refused = {name: self._refused[name] for name in names if name in self._refused}
         for name in names:
             source, record = self._intake.sources[name], self._records[name]
             before = self._before.get(name)
@@ -222,7 +223,7 @@ class Conduct:
         `HOLD`."""
         known = journal.refused_of.get(source.name)
         refused = 0 if known is None else known["old-epoch"]
-        more = refused - self._refused.get(source.name, 0)
+        more = refused - self._refused.get(source.name, refused)
         self._refused[source.name] = refused
         gone = max(time - record.time, 0) / 1e9 if record.time >= 0 else 0.0
         stays = float(np.exp(-gone / HOLD))
@@ -323,6 +324,7 @@ class Conduct:
         for name, (columns, *rest) in packed.get("records", {}).items():
             read = (from_bytes(one, np.zeros(0, kind)) for one, kind in zip(columns, COLUMNS.values(), strict=True))
             self._records[str(name)] = _Record(dict(zip(COLUMNS, read, strict=True)), *rest)
+        self._refused = dict.fromkeys(self._records, 0)
         self._alone = {int(track): int(since) for track, since in packed.get("alone", [])}
         self._warnings.restore(packed.get("warnings", []))
         self._snapshot()

@@ -24,6 +24,10 @@ from fusion_service.densities import Mixtures
 __all__ = ["Bias"]
 
 PAIRS = (("x", "y"), ("vx", "vy"), ("ax", "ay"))
+TRIFLE = 1e-12
+"""By which variances of what stays are larger: what they are added to may be less than what is lost in rounding."""
+LEAST_STRETCH = 0.1
+"""No scale is taken off that makes ranges ten times as long."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -69,7 +73,7 @@ class Bias:
     def _place(self, z: Floats) -> tuple[Floats, Floats]:
         """Places (2, T) corrected, and the Jacobian (2, 2, T) of that."""
         c, s = np.cos(self.value[HEADING]), np.sin(self.value[HEADING])
-        stretch, shift = 1.0 + self.value[SCALE], self.value[RANGE]
+        stretch, shift = max(1.0 + self.value[SCALE], LEAST_STRETCH), self.value[RANGE]
         away = z - self.site[:, None] - self.value[[X, Y]][:, None]
         d = np.stack([c * away[0] + s * away[1], -s * away[0] + c * away[1]])
         far = np.hypot(d[0], d[1])
@@ -103,6 +107,8 @@ class Bias:
             H[vx, SCALE], H[vy, SCALE] = velocity
         if {"vx", "vy", "ax", "ay"} <= set(space):
             H[vx, CLOCK], H[vy, CLOCK] = -mean[space.index("ax")], -mean[space.index("ay")]
-        return linalg.congruence(
-            H, np.broadcast_to(self.covariance[:, :, None], (*self.covariance.shape, mean.shape[1]))
-        )
+        spread = np.broadcast_to(self.covariance[:, :, None], (*self.covariance.shape, mean.shape[1]))
+        out = linalg.congruence(H, spread)
+        for k in range(n):
+            out[k, k] *= 1.0 + TRIFLE
+        return out

@@ -68,28 +68,30 @@ class Posterior:
 
 class Information:
     """What shared targets have told of the errors of the sources `names`. shared (S, S): how many targets two of them
-    had in common, fading; on the diagonal those that one had with any."""
+    had in common, fading; on the diagonal those that one had with any. pending: what all that is known is to be
+    multiplied by when it fades next: an estimate that was made before it is kept is made again to the bit."""
 
     def __init__(self, names: tuple[str, ...] = ()) -> None:
         self.names = names
         self.matrix = np.zeros((len(names), P, len(names), P))
         self.vector = np.zeros((len(names), P))
         self.shared = np.zeros((len(names), len(names)))
+        self.pending = 1.0
 
     def fade(self, kept: float, dt: float) -> None:
         """Go on by `dt` seconds, in which clocks drift, and keep this share of all that is known."""
-        self.matrix, self.vector, self.shared = kept * self.matrix, kept * self.vector, kept * self.shared
+        share, self.pending = kept * self.pending, 1.0
+        self.matrix, self.vector, self.shared = share * self.matrix, share * self.vector, kept * self.shared
         self.matrix[:, DRIFT] -= dt * self.matrix[:, CLOCK]
         self.matrix[..., DRIFT] -= dt * self.matrix[..., CLOCK]
         self.vector[:, DRIFT] -= dt * self.vector[:, CLOCK]
 
     def reweigh(self, before: Floats, now: Floats) -> None:
         """What the information of each source (S,) is divided by was `before`: it is `now`, on the mean of all of them
-        by what they share, also for what was taken."""
+        by what they share, also for what was taken; from the next step on."""
         weight = np.diagonal(self.shared)
         if weight.any():
-            factor = float(np.exp((weight * (np.log(before) - np.log(now))).sum() / weight.sum()))
-            self.matrix, self.vector = factor * self.matrix, factor * self.vector
+            self.pending *= float(np.exp((weight * (np.log(before) - np.log(now))).sum() / weight.sum()))
 
     def arrange(self, names: tuple[str, ...]) -> None:
         """Be about these sources: nothing is known of new ones, and those that are gone are eliminated."""
@@ -166,13 +168,14 @@ class Information:
 
     def packed(self) -> list[object]:
         """As plain values."""
-        return [list(self.names), *(to_bytes(one) for one in (self.matrix, self.vector, self.shared))]
+        return [list(self.names), self.pending, *(to_bytes(one) for one in (self.matrix, self.vector, self.shared))]
 
     @classmethod
     def unpacked(cls, packed: list[object]) -> Information:
         """From what `packed` gave."""
-        names, *parts = packed
+        names, pending, *parts = packed
         made = cls(tuple(str(name) for name in names))  # type: ignore[attr-defined]
+        made.pending = float(pending)  # type: ignore[arg-type]
         like = (made.matrix, made.vector, made.shared)
         made.matrix, made.vector, made.shared = (
             from_bytes(part, one).reshape(one.shape)  # type: ignore[arg-type]

@@ -183,7 +183,8 @@ class Honesty:
 
     def _numbers(self, names: tuple[str, ...]) -> Ints:
         """The number that each source has here."""
-        if len(self._names) > MOST_NAMES:
+        full = len(self._names) > MOST_NAMES or len(self._sums.key) >= MOST_SOURCE_PAIRS
+        if full and not set(self._names) <= set(names):
             self._rename(sorted(set(self._names) & set(names)))
         place = {name: i for i, name in enumerate(self._names)}
         new = [name for name in names if name not in place]

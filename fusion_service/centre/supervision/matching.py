@@ -61,6 +61,8 @@ def match(one: Tracks2, other: Tracks2, site: Floats, sigma: Floats) -> tuple[In
     H = design(one.place[:, i], one.velocity[:, i], np.repeat(site[:, None], len(i), axis=1))
     kinds = [(CLOCK,), (X, Y), (HEADING,), (RANGE,)]
     found = [_verify(kind, H, away, spread, i, j, sigma) for kind in kinds if all(sigma[k] > 0 for k in kind)]
+    if not found:
+        return none, none
     score = np.concatenate([scores for scores, _ in found])
     inside = np.concatenate([which for _, which in found])
     if not len(score):

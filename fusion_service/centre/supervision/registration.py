@@ -18,6 +18,7 @@ from fusion_service.arrays import Bools, Floats, Ints, from_bytes, to_bytes
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
+from fusion_service.centre.places import Place
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.centre.supervision import telling
@@ -69,7 +70,7 @@ class Registration:
         self._applied: dict[str, Applied] = {}
         self._known: _Known | None = None
         self._weights = np.zeros((0, P))
-        self._standings: dict[str, tuple[SensorInfo | None, Floats, Floats]] = {}
+        self._standings: dict[str, tuple[SensorInfo | None, Place | None, Floats, Floats]] = {}
         self._unlinked = Unlinked()
         self._step, self._time = 0, -1
 
@@ -226,10 +227,10 @@ class Registration:
         """How large the errors of a source may be (7,), and its place (2,); kept while it says the same of itself."""
         source = self._intake.sources[name]
         kept = self._standings.get(name)
-        if kept is None or kept[0] is not source.info:
-            kept = source.info, prior_sigma(self._intake, source), site_of(self._intake, source)
-            self._standings[name] = kept
-        return kept[1:]
+        if kept is None or kept[0] is not source.info or kept[1] is not source.place:
+            here = prior_sigma(self._intake, source), site_of(self._intake, source)
+            kept = self._standings[name] = source.info, source.place, *here
+        return kept[2:]
 
     def _weigh(self, part: Compared) -> None:
         """How large the errors, and what stays of them, are beside those that the rows have of their own: (S, 2), mean

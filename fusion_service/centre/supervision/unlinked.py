@@ -21,6 +21,8 @@ BELIEVED, MOST_VOTES = 3, 5
 EXPIRES = 120
 """Steps in which a pair was not looked for."""
 MOST_PAIRS = 2000
+MOST_COMPARED = 1_000_000
+"""Tracks of one source times those of the other: of more, every so many of the one, in turns."""
 FEW_LINKS = 0.5
 """Of the tracks of that source that has fewer: more links than that are enough."""
 
@@ -46,6 +48,8 @@ class Unlinked:
         a, b = (np.flatnonzero((rows.source == k) & (rows.tracks.link != NO_TRACK)) for k in (one, other))
         if rows.tracks.origin[a[0]] != rows.tracks.origin[b[0]]:
             return
+        every = -(-len(a) * len(b) // MOST_COMPARED)
+        a = a[(self._turn // len(pairs)) % every :: every]
         both = np.hypot(sigma[whose[one]], sigma[whose[other]])
         first, second = _plane(rows, a, space), _plane(rows, b, space)
         i, j = match(first, second, sites[:, whose[other]], both)

@@ -63,6 +63,17 @@ def test_errors_of_place_are_found_within_their_sigma() -> None:
         assert confirmed(result) == 25
 
 
+def test_a_sensor_that_moves_is_turned_about_where_it_is() -> None:
+    """A ship at 40 m/s with a compass that is wrong: over a minute its place moves by 2.4 km, which would be 42 m."""
+    ship = Offset(place=(-20e3, 8e3), heading=math.radians(1.0), way=(40.0, -10.0))
+    result = World({"a": Offset(place=(10e3, 0.0)), "b": ship}, seed=3, **{**CORRECT, **A}).run(60)
+    off = wrong(result, "b", ship)
+    assert max(map(abs, off.values())) < 4.0, off
+    found = bias(result, "b")["heading"]
+    assert found["observable"]
+    assert found["sigma"] < math.radians(0.05)
+
+
 @pytest.mark.parametrize("how", [{}, {"lasting": 0.8}, {"tracker": True}], ids=["white", "lasting", "trackers"])
 def test_estimates_are_as_uncertain_as_they_say(how: dict[str, Any]) -> None:
     """NEES over runs with other errors each: the mean over the 99.9 % interval of its chi-square, and not far below.
