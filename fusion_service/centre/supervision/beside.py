@@ -84,13 +84,19 @@ class Beside:
         return np.asarray(rows.fresh[one] | rows.fresh[two])
 
     def _parted(self, rows: Rows, one: Ints, two: Ints) -> Bools:
-        """Pairs that were together, are apart, and one of them has something new."""
+        """Pairs that were together, are apart, and one of them has something new; not where one is now linked to
+        another track of the other's source: an id went over to another target."""
         if not len(rows.source):
             return np.zeros(len(one), dtype=np.bool_)
         link = rows.tracks.link
         together = (link[one] == link[two]) & (link[one] != NO_TRACK)
         apart = (one >= 0) & (two >= 0) & ~together & (self._met.held < HELD)
-        return np.asarray(apart & self._fresh(rows, one, two))
+        _, target = np.unique(link, return_inverse=True)
+        size = int(rows.source.max()) + 1
+        linked = np.flatnonzero(link != NO_TRACK)
+        there = target[linked] * size + rows.source[linked]
+        mine, its = target[one] * size + rows.source[two], target[two] * size + rows.source[one]
+        return np.asarray(apart & self._fresh(rows, one, two) & ~np.isin(mine, there) & ~np.isin(its, there))
 
     def keep(self, rows: Rows, first: Ints, second: Ints, held: NDArray[np.int64], difference: Floats) -> None:
         """Remember the pairs of this step, and those of the last in which nothing is new."""
