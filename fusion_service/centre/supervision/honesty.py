@@ -62,7 +62,8 @@ class Opinion:
     of `BLOCKS`; factor: the same, 1 where nothing speaks against them; wrong: which of them are too small, beyond
     chance and `MATTERS`; decided: whether it is known that it is this source; contradiction: the largest scale of
     differences that are beyond chance, where it is not; compared: comparisons behind it; beside: whom with; constant:
-    m by which its positions differ in the mean, where that is most of it, else 0."""
+    m by which its positions differ in the mean, where that is most of it, else 0; covers: the factor of positions is
+    that of an error of clock or place, told and not taken off."""
 
     consistency: float = np.nan
     low: float = np.nan
@@ -75,6 +76,7 @@ class Opinion:
     compared: float = 0.0
     beside: tuple[str, ...] = ()
     constant: float = 0.0
+    covers: bool = False
 
 
 BASE = 2**20

@@ -65,7 +65,7 @@ class Registration:
         self._frame = self._intake.frame
         self._information, self._lasting = Information(), Lasting()
         self._seen = np.zeros((0, SEEN))
-        self._effect = np.zeros((0, 2))
+        self._effect = np.zeros((0, 3))
         self._epochs: dict[str, int] = {}
         self._applied: dict[str, Applied] = {}
         self._known: _Known | None = None
@@ -233,8 +233,8 @@ class Registration:
         return kept[2:]
 
     def _weigh(self, part: Compared) -> None:
-        """How large the errors, and what stays of them, are beside those that the rows have of their own: (S, 2), mean
-        squares."""
+        """How large the errors, and what stays of them, are beside those that the rows have of their own: (S, 3), mean
+        squares; last the errors beside what the source says of its own, before it is treated."""
         if not len(part.row) or self._known is None:
             return
         group = part.group
@@ -245,7 +245,8 @@ class Registration:
         stays = sum(common[i, j] * inverse[j, i] for i in (0, 1) for j in (0, 1)) / 2.0
         count = np.bincount(group.source, minlength=len(self._effect))
         there = count > 0
-        for column, value in enumerate((square, stays)):
+        said = np.array([self._intake.treatment(name).inflation[0] for name in self._information.names])[group.source]
+        for column, value in enumerate((square, stays, square * said)):
             new = np.bincount(group.source, np.asarray(value), minlength=len(count))[there] / count[there]
             old = self._effect[there, column]
             self._effect[there, column] = np.where(old > 0, old + 0.2 * (new - old), new)
@@ -292,9 +293,14 @@ class Registration:
         return applied.on, applied.told.tobytes()
 
     def size(self, name: str) -> float:
-        """Mean square of the error of a source beside those that its tracks have of their own."""
+        """Mean square of the error of a source beside those that it says its tracks have of their own."""
         names = self._information.names
-        return float(self._effect[names.index(name), 0]) if name in names else 0.0
+        return float(self._effect[names.index(name), 2]) if name in names else 0.0
+
+    def told_only(self, name: str) -> bool:
+        """Whether its error is certain and matters, and nothing is taken off."""
+        applied = self._applied.get(name, Applied())
+        return applied.found and not applied.on
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
@@ -350,7 +356,7 @@ class Registration:
         self._lasting = Lasting.unpacked(packed["lasting"])
         like = np.zeros(0)
         self._seen = from_bytes(packed["seen"], like).reshape(-1, SEEN)
-        self._effect = from_bytes(packed["effect"], like).reshape(-1, 2)
+        self._effect = from_bytes(packed["effect"], like).reshape(-1, 3)
         self._weights = from_bytes(packed["weights"], like).reshape(-1, P)
         self._epochs = {str(name): int(epoch) for name, epoch in packed["epochs"].items()}
         self._applied = {str(name): Applied.unpacked(one) for name, one in packed["applied"].items()}

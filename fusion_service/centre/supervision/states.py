@@ -21,7 +21,7 @@ from typing import Any
 from fusion_service.centre.supervision.honesty import BLOCKS, Opinion
 from fusion_service.order import STATES
 
-__all__ = ["State", "States", "reason"]
+__all__ = ["State", "States", "covering", "reason"]
 
 TREATED = 1.5
 """Factor on variances from which a source is treated."""
@@ -168,11 +168,32 @@ def _event(name: str, was: State, now: State, opinion: Opinion) -> dict[str, Any
     return event
 
 
+def covering(opinion: Opinion, size: float) -> Opinion:
+    """The same, of a source whose error of clock or place is told and not taken off: `size`, mean square of it beside
+    what it says. What it is certain to be wrong by is in its covariance then, unless others do not show it any more."""
+    factor = 1.0 + size
+    if not opinion.consistency > OVER or factor < max(TREATED, opinion.factor[0] if opinion.decided else 1.0):
+        return opinion
+    return replace(
+        opinion,
+        estimate=(factor, opinion.estimate[1]),
+        factor=(factor, opinion.factor[1]),
+        wrong=(True, opinion.wrong[1] and opinion.decided),
+        decided=True,
+        covers=True,
+    )
+
+
 def reason(opinion: Opinion) -> str:
     """A sentence with its numbers."""
     left = len(opinion.beside) - NAMED
     others = ", ".join(opinion.beside[:NAMED]) + (f" and {left} more" if left > 0 else "")
     count = f"over {opinion.compared:.0f} comparisons"
+    if opinion.covers:
+        return (
+            f"errors of its clock or place, told and not taken off, are {opinion.factor[0] - 1.0:.3g} times (variance) "
+            "what its positions are uncertain by themselves: see its bias"
+        )
     if opinion.decided:
         values = zip(BLOCKS, opinion.wrong, opinion.factor, strict=True)
         parts = [f"{what} scatter {value:.3g}" for what, wrong, value in values if wrong]

@@ -17,7 +17,7 @@ from fusion_service.centre.supervision.conduct import Conduct
 from fusion_service.centre.supervision.honesty import Honesty, Innovations, Opinion
 from fusion_service.centre.supervision.registration import Registration
 from fusion_service.centre.supervision.shared import Shared, shared_pairs
-from fusion_service.centre.supervision.states import States
+from fusion_service.centre.supervision.states import States, covering
 from fusion_service.centre.supervision.traffic import Traffic
 from fusion_service.centre.treatment import Treatment
 
@@ -68,6 +68,9 @@ class Supervisor:
                 self._frame = self._intake.frame
             self._honesty.observe(rows, names, self._beside(rows, names, shared, step), self._applied(names))
             self._opinions = self._honesty.opinions(self._chance(time), own or {})
+            for name in filter(self.registration.told_only, names):
+                opinion = self._opinions.get(name, Opinion())
+                self._opinions[name] = covering(opinion, self.registration.size(name))
             for event in self.states.settle(names, self._opinions, self._orders(), self._stuck(names), time):
                 journal.event(event)
             if changed := self._otherwise(names, before) | dict.fromkeys(jumped, np.inf):

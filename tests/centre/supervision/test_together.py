@@ -100,7 +100,19 @@ def test_of_two_neither_is_believed_where_places_differ(how: str) -> None:
         assert square < 1.5 < without
     else:
         assert square < without
-        assert (states(results, "a")[-1], states(results, "b")[-1]) == ("union", "union")
+        assert (states(results, "a")[-1], states(results, "b")[-1]) == ("inflated", "inflated")
+        assert "told and not taken off" in results[-1].status.sources["a"]["state_why"]
+    assert shown(results[-1]) == 10
+
+
+def test_two_of_five_that_agree_are_covered_and_the_others_left_alone() -> None:
+    bad = Offset(x=200.0, sigma=(10.0, 2.0), tracker=True)
+    world = World(dict.fromkeys("acde", GOOD) | {"b": bad, "d": bad}, 10, speed=60.0, seed=3, **RULED)
+    results = [world.step() for _ in range(30)]
+    assert shown(results[-1]) == 10
+    assert {states(results, name)[-1] for name in "bd"} == {"inflated"}
+    assert {one for name in "ace" for one in states(results, name)} == {"trusted"}
+    assert scores(world, results[-1]) < 1.5
 
 
 def test_half_of_a_difference_may_be_none_of_it() -> None:
