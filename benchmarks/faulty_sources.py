@@ -71,7 +71,7 @@ def run(world: World, mode: str, **config: Any) -> Found:
         for event in result.log.events:
             if event["kind"] in ("supervision", "registration", "alarm"):
                 events.append({"second": second, **event})
-                good = event.get("state") == "trusted" or (event["kind"] == "alarm" and "track" in event)
+                good = event.get("state") == "trusted"
                 if event["source"] in world.wrong:
                     named = second if np.isnan(named) and not good else named
                 elif not good:

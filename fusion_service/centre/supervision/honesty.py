@@ -21,7 +21,8 @@ from fusion_service.arrays import Bools, Floats, Ints, from_bytes, to_bytes
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.supervision.beside import Beside
-from fusion_service.centre.supervision.hat import Factors, Pairs, decidable, solved
+from fusion_service.centre.supervision.deciding import beyond, mean_scale, pair_beyond, unexplained, with_innovations
+from fusion_service.centre.supervision.hat import Pairs, solved
 from fusion_service.centre.supervision.scale import BINS, CUT, binned, high_bound, low_bound, robust_scale, sigmas
 from fusion_service.centre.supervision.shared import Shared
 from fusion_service.centre.supervision.sums import Sums
@@ -46,8 +47,6 @@ RECENT = 5.0
 """Steps that the recent mean is about."""
 MENDED, FORGOTTEN = 0.4, 0.8
 """Part of a scale, below which the recent mean says that it is no more, and what is kept then, of what was before."""
-MATTERS = 1.25
-"""A factor on variances below which nothing is said, though it may be no chance."""
 CONSTANT = 0.5
 """Part of the mean square of a difference that is its mean squared, from which it is called constant."""
 
@@ -160,7 +159,7 @@ class Honesty:
         for name, new in more:
             column = getattr(sums, name)
             column[:, block] = kept * (column[:, block] + new)
-        self._mended(block, scale, count, np.bincount(pair, np.minimum(square, cut), K))
+        self._mended(block, scale, count, np.bincount(pair, np.minimum(square, cut), K).astype(float))
         if difference is None:
             return
         usual = square < cut
@@ -168,7 +167,7 @@ class Honesty:
             for column, value in ((sums.offset, r), (sums.squared, r * r)):
                 column[:, axis] = kept * (column[:, axis] + np.bincount(pair[usual], weights=value, minlength=K))
 
-    def _mended(self, block: int, scale: Floats, count: Ints, square: Floats) -> None:
+    def _mended(self, block: int, scale: Floats, count: Floats, square: Floats) -> None:
         """Forget soon what is no more: of pairs (K,) whose differences, `count` new ones with the sum `square`, have
         become far smaller than their `scale` says. What has been mended is to be seen before it fades by itself."""
         sums, there = self._sums, count > 0
@@ -236,17 +235,17 @@ class Honesty:
             pairs, some = self._pairs(block, k)
             enough = pairs.count >= FEW
             pairs, some = pairs.take(enough), some[enough]
-            pairs, sure = _with_innovations(pairs, S, self._innovations(own), z)
+            pairs, sure = with_innovations(pairs, S, self._innovations(own), z)
             found = solved(pairs, self._factors[block])
             self._factors[block] = found.value
-            suspect = _pair_beyond(pairs, z) & (pairs.first != pairs.second)
-            sure = sure & ~_unexplained(pairs, found.value, suspect)
-            wrong[block] = sure & _beyond(found, z)
+            suspect = pair_beyond(pairs, z) & (pairs.first != pairs.second)
+            sure = sure & ~unexplained(pairs, found.value, suspect)
+            wrong[block] = sure & beyond(found, z)
             for side in (pairs.first, pairs.second):
                 np.maximum.at(doubted[block], side[suspect], pairs.scale[suspect])
             doubted[block, sure] = 1.0
             if block == 0:
-                consistency, count = _mean_scale(pairs, S)
+                consistency, count = mean_scale(pairs, S)
         return self._told(wrong, doubted, consistency, count, z, first, second, sums)
 
     def _told(
@@ -349,53 +348,3 @@ def _whitened(P: Floats, Q: Floats, r: Floats) -> tuple[Floats, Floats]:
             y[row] -= L[row, column] * y[column]
     with np.errstate(all="ignore"):
         return y / np.sqrt(d), linalg.inner(linalg.inverse(S), P) / len(r)
-
-
-def _with_innovations(pairs: Pairs, S: int, own: list[tuple[int, float, float]], z: float) -> tuple[Pairs, Bools]:
-    """The pairs, with what sources say of themselves where the pairs alone leave it open who is wrong; and of whom
-    (S,) it is known then. Only of sources that contradict another: innovations depend on the motion that is declared
-    too, and tell which of two is wrong, not whether one is."""
-    sure, k = decidable(pairs, S), pairs.k
-    suspect = _pair_beyond(pairs, z)
-    against = np.isin(np.arange(S), np.concatenate([pairs.first[suspect], pairs.second[suspect]]))
-    open_ = [one for one in own if against[one[0]] and not sure[one[0]]]
-    if not open_:
-        return pairs, sure
-    at = np.array([i for i, _, _ in open_], dtype=np.intp)
-    ratio, freedom = np.array([r for _, r, _ in open_]), np.array([f for _, _, f in open_])
-    pairs = pairs.join(Pairs(at, at, ratio, np.ones(len(at)), np.maximum(freedom, 1.0) / k, k))
-    return pairs, decidable(pairs, S)
-
-
-def _beyond(found: Factors, z: float) -> Bools:
-    """Whose factors (S,) are above 1 by more than chance, and more than matters."""
-    freedom = np.maximum(found.freedom, 0.2)
-    skewed = (high_bound(freedom, z) - 1.0) / np.sqrt(2.0 / freedom)
-    return np.asarray((found.value > MATTERS) & (found.value - 1.0 > np.maximum(skewed, z) * found.sigma))
-
-
-def _unexplained(pairs: Pairs, value: Floats, suspect: Bools) -> Bools:
-    """Which sources (S,) of `suspect` pairs differ from the other by more than the factors `value` (S,) explain, where
-    these are known by innovations only: an offset of place or clock is in none, and which of two has it is not known
-    from them."""
-    explained = value[pairs.first] * pairs.share + value[pairs.second] * (1.0 - pairs.share)
-    some = suspect & (pairs.scale > MATTERS * explained)
-    S, real = len(value), pairs.first != pairs.second
-    alone = ~decidable(pairs.take(real), S)
-    return alone & np.isin(np.arange(S), np.concatenate([pairs.first[some], pairs.second[some]]))
-
-
-def _pair_beyond(pairs: Pairs, z: float) -> Bools:
-    """Which pairs (K,) differ by more than both say, beyond chance and what matters."""
-    return np.asarray(pairs.scale > np.maximum(high_bound(pairs.k * pairs.count / 1.1, z), MATTERS))
-
-
-def _mean_scale(pairs: Pairs, S: int) -> tuple[Floats, Floats]:
-    """Mean of the scales of each source's pairs (S,), NaN without, and how many independent differences it has."""
-    weight, value, most = np.zeros(S), np.zeros(S), np.zeros(S)
-    real = pairs.first != pairs.second
-    for side in (pairs.first[real], pairs.second[real]):
-        np.add.at(weight, side, pairs.count[real])
-        np.add.at(value, side, (pairs.count * pairs.scale)[real])
-        np.maximum.at(most, side, pairs.count[real])
-    return np.where(weight > 0.0, value / np.where(weight > 0.0, weight, 1.0), np.nan), most

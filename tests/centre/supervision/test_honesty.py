@@ -15,8 +15,9 @@ import schemas
 from fusion_service.arrays import Floats
 from fusion_service.centre import FusionCentre, Order, StepResult
 from fusion_service.centre.rows import Rows
+from fusion_service.centre.supervision.deciding import with_innovations
 from fusion_service.centre.supervision.hat import Pairs, decidable, solved
-from fusion_service.centre.supervision.honesty import Honesty, Opinion, _with_innovations
+from fusion_service.centre.supervision.honesty import Honesty, Opinion
 from fusion_service.centre.supervision.scale import BINS, binned, high_bound, low_bound, robust_scale, sigmas
 from fusion_service.centre.supervision.shared import shared_pairs
 from fusion_service.centre.supervision.states import States
@@ -243,7 +244,7 @@ def test_innovations_alone_are_no_contradiction() -> None:
     for scale, wrong in ((1.0, False), (5.0, True)):
         rng = np.random.default_rng(SEED)
         pairs = all_pairs(2, np.array([1.0, 2.0 * scale - 1.0]), np.full(2, 100.0), 400.0, rng)
-        joined, sure = _with_innovations(pairs, 2, [(0, 3.0, 400.0), (1, 9.0, 400.0)], 4.0)
+        joined, sure = with_innovations(pairs, 2, [(0, 3.0, 400.0), (1, 9.0, 400.0)], 4.0)
         assert (len(joined.first), sure.tolist()) == ((3, [True, True]) if wrong else (1, [False, False]))
 
 

@@ -72,7 +72,8 @@ def test_what_no_correction_mends_is_covered_in_part() -> None:
     sources = {name: replace(GOOD, place=place) for name, place in places.items()}
     sources["b"] = replace(sources["b"], range=120.0)
     results = {}
-    for how in ({"registration": "correct"}, {"registration": "off", "supervision": "off"}):
+    hows: tuple[dict[str, Any], ...] = ({"registration": "correct"}, {"registration": "off", "supervision": "off"})
+    for how in hows:
         world = World(sources, 12, speed=60.0, seed=3, spread=10e3, **how, **RULED)
         results[how["registration"]] = [world.step() for _ in range(40)]
     assert shown(results["correct"][-1]) <= 0.75 * shown(results["off"][-1])
