@@ -254,15 +254,18 @@ def road(data: Path) -> None:
         print(f"clock known to {clock_sigma} s: {told(results[-1], 'radar')}", flush=True)
 
 
+EACH = ("clock", "nees", "honest", "drift", "radars", "cost", "autoferry", "radar-v2x")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument(
-        "what", choices=["clock", "nees", "honest", "drift", "radars", "cost", "autoferry", "radar-v2x"], nargs="+"
-    )
+    parser.add_argument("what", nargs="*", metavar="WHAT", help=", ".join(EACH))
     parser.add_argument("--runs", type=int, default=0, help="runs or hours (default: 3; nees: 200; honest: 1)")
     parser.add_argument("--data", type=Path, default=os.environ.get("FUSION_DATA"), help="folder of recordings")
     given = parser.parse_args(arguments)
-    for what in given.what:
+    if unknown := set(given.what) - set(EACH):
+        parser.error(f"no {', '.join(sorted(unknown))}: known are {', '.join(EACH)}")
+    for what in given.what or EACH:
         if what in ("autoferry", "radar-v2x"):
             if given.data is None:
                 parser.error(f"{what} needs --data DIR or FUSION_DATA")

@@ -10,14 +10,14 @@ import pytest
 import schemas
 from fusion_service.arrays import Ints
 from fusion_service.centre.supervision import honesty, unlinked
+from fusion_service.centre.supervision.deciding import with_innovations
 from fusion_service.centre.supervision.hat import Pairs
-from fusion_service.centre.supervision.honesty import _with_innovations
 from fusion_service.centre.supervision.matching import Tracks2, match
 from tests.centre.test_random_missions import check_mission
 from tests.centre.worlds import SPACE, centre, give, moved, step, tracks, truth
 from tests.helpers import source_missions
 
-QUICK, STEPS = (1, 38), 18
+QUICK, STEPS = (7, 38), 18
 
 
 @pytest.mark.parametrize("seed", QUICK[1:])
@@ -94,11 +94,11 @@ def test_nothing_is_thought_of_a_source_beside_nobody() -> None:
     """Its own innovations decide who of two is wrong; with nobody to be compared with they name no one."""
     none, nobody = np.zeros(0), np.zeros(0, dtype=np.intp)
     alone = Pairs(nobody, nobody, none, none, none, 2)
-    joined, sure = _with_innovations(alone, 2, [(0, 4.5, 100.0)], 2)
+    joined, sure = with_innovations(alone, 2, [(0, 4.5, 100.0)], 2)
     assert not len(joined.first)
     assert not sure.any()
     two = Pairs(np.array([0]), np.array([1]), np.array([2.5]), np.array([0.5]), np.array([50.0]), 2)
-    joined, sure = _with_innovations(two, 2, [(0, 4.5, 100.0)], 2)
+    joined, sure = with_innovations(two, 2, [(0, 4.5, 100.0)], 2)
     assert len(joined.first) == 2
     assert sure.all()
 
