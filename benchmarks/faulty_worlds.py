@@ -102,8 +102,8 @@ def _heard(scene: Scene, sensor: Sensor, path: Path, rng: np.random.Generator) -
         places = flickers(rng, scans, scene.clutter, 20e3, 3.0, sensor.drop)
         also = places, np.full(places.shape[1], -1)
     if wrong.ghosts:
-        times = sensor.period * np.arange(1, scans + 1)
-        own = np.array(random_walks(wrong.ghosts)(rng, scene.seconds + 60)(times)[..., :2])
+        times: Floats = sensor.period * np.arange(1.0, scans + 1)
+        own: Floats = np.array(random_walks(wrong.ghosts)(rng, scene.seconds + 60)(times)[..., :2])
         own[(times < wrong.begin) | (times >= wrong.end)] = np.nan
         also = own, np.full(wrong.ghosts, -1)
 
