@@ -124,8 +124,11 @@ class Memory:
 
     def _capable(self, rows: Rows, names: tuple[str, ...]) -> Bools:
         """Rows (M,) whose versions may be taken as tracklets."""
-        doubted = (self._intake.treatment(name).union for name in names)
-        able = (not self.watch.records[name].reason and not union for name, union in zip(names, doubted, strict=True))
+        treatments = [self._intake.treatment(name) for name in names]
+        able = (
+            not (self.watch.records[name].reason or one.union or one.lasting)
+            for name, one in zip(names, treatments, strict=True)
+        )
         sources = np.array([*able], dtype=np.bool_)[rows.source] & ~off_centre(rows, self._config.space)
         return sources & sound_rows(rows) & ~self._unseen(rows, names) & kinship.alone(self._intake, rows)
 

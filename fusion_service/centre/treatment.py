@@ -37,13 +37,15 @@ class Correction(Protocol):
 class Treatment:
     """clock: ns that a source's time stamps are too late; what is stamped t held at t - clock. correction: what is
     taken off its states. inflation: factors on the variances of its positions and of the rest. out: it is watched, but
-    fused with nothing, and starts nothing. union: with others by covariance union."""
+    fused with nothing, and starts nothing. union: with others by covariance union. lasting: its errors stay the same:
+    its successive data are not taken as tracklets."""
 
     clock: int = 0
     correction: Correction | None = None
     inflation: tuple[float, float] = (1.0, 1.0)
     out: bool = False
     union: bool = False
+    lasting: bool = False
 
 
 AS_IT_IS = Treatment()

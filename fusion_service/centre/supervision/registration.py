@@ -297,6 +297,11 @@ class Registration:
         names = self._information.names
         return float(self._effect[names.index(name), 2]) if name in names else 0.0
 
+    def halves(self, name: str) -> bool:
+        """Whether its error is told as half of a difference to one other."""
+        names, known = self._information.names, self._known
+        return known is not None and name in names and halved(known.label, known.reference, names.index(name))
+
     def told_only(self, name: str) -> bool:
         """Whether its error is certain and matters, and nothing is taken off."""
         applied = self._applied.get(name, Applied())

@@ -129,7 +129,8 @@ class Supervisor:
         state = self.states.of(name)
         factors = state.inflation if state.state in ("inflated", "out") else (1.0, 1.0)
         out, union = state.state == "out", state.state == "union"
-        return Treatment(*self.registration.correction(name), inflation=factors, out=out, union=union)
+        lasting = factors != (1.0, 1.0) and self.registration.told_only(name) and self.registration.halves(name)
+        return Treatment(*self.registration.correction(name), factors, out, union, lasting)
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
