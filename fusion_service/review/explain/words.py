@@ -302,6 +302,8 @@ class _Teller:
             return f"its existence fell below {config.min_existence:g} (min_existence) without a source"
         if picture.status[row] == TENTATIVE and not (config is not None and silent > config.coast):
             return f"no source had it any more after {self.time(story.supported)} s, and it was tentative"
+        if config is not None and 0 < silent <= config.coast:
+            return f"its sources list it no more, and for {silent:.1f} s no report has brought it back"
         if picture.status[row] == COASTING or silent > 0:
             limit = f", longer than {config.coast:g} s (coast)" if config is not None else ""
             return f"no source had it for {silent:.1f} s{limit}"

@@ -42,7 +42,7 @@ def test_table_page_and_numbers_tell_of_the_sources(tmp_path: Path, capsys: pyte
 
 
 def test_a_centre_that_says_nothing_of_them_has_no_section(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flight = fly(4)
+    flight = fly(4, supervision="off", registration="off")
     assert main(["evaluate", str(flight.record(tmp_path / "a.rrd")), "--html", str(tmp_path / "a.html")]) == 0
     assert "The sources" not in capsys.readouterr().out
 

@@ -209,8 +209,8 @@ def test_who_leaves_and_why(joined: tuple[Path, Flight]) -> None:
 
 
 def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
-    """r1's track is lost at 5 s: it coasts for 3 s and ends; r2 is muted at 8 s: its track goes the same way; track 3
-    of r3 is deleted by order at 12 s."""
+    """r1 lists its track no more at 5 s: it ends with the next report; r2 is muted at 8 s: its track coasts for 3 s;
+    track 3 of r3 is deleted by order at 12 s."""
     flight = Flight({"coast": 3.0})
 
     def seen_by(name: str, second: float) -> dict[int, Sequence[float]]:
@@ -228,11 +228,12 @@ def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
     text = told(path, "1")
     assert line(text, "r1 5 leaves: the source lists it no more").startswith("4.0")
     assert line(text, "coasts: no source has it").startswith("4.0")
-    assert "ended: no source had it for 4.0 s, longer than 3 s (coast)" in line(text, "ended")
-    assert line(text, "ended").startswith("7.0")
-    assert "It coasted for 3 of its 7 steps." in text
+    assert "ended: its sources list it no more, and for 3.0 s no report has brought it back" in line(text, "ended")
+    assert line(text, "ended").startswith("6.0")
+    assert "It coasted for 2 of its 6 steps." in text
 
     text = told(path, "2")
+    assert "ended: no source had it for 4.0 s, longer than 3 s (coast)" in line(text, "ended")
     assert line(text, "r2 6 leaves: the source was muted by order").startswith("7.0")
     assert line(text, "order to mute r2").startswith("7.0")
     assert "order to mute r2 by anna (noise): refuses what r2 sends" in text
@@ -244,7 +245,7 @@ def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
     assert "order to delete it: ends track" in text
     table = listing(read_mission(path))
     rows = {one.split()[0]: one for one in table.splitlines()[2:-1]}
-    assert rows["1"].split()[1:4] == ["0.0", "7.0", "7.0"]
+    assert rows["1"].split()[1:4] == ["0.0", "6.0", "6.0"]
     assert rows["1"].endswith("r1       lost")
     assert rows["3"].rstrip().endswith("ordered")
     assert table.splitlines()[-1].startswith("3 tracks")
@@ -292,7 +293,7 @@ def test_labels_are_found_as_they_are_given() -> None:
 
 def test_many_spells_outside_the_gate_are_one_line(tmp_path: Path) -> None:
     """r2 is 250 m off at every other step: outside its gate, but never so far that the link breaks."""
-    flight = Flight({})
+    flight = Flight({"supervision": "off"})
     far = {"r1": lambda s: 0.0, "r2": lambda s: 250.0 if s > 3 and s % 2 else 10.0, "r3": lambda s: -10.0}
     places(flight, range(1, 31), lambda name, second: {1: spread(far[name](second))})
     assert len(decided(flight, GATE_FAILED)) == 13
