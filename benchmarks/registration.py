@@ -82,7 +82,8 @@ def nees(runs: int, seconds: int = 40) -> None:
         values, ratios = [], []
         for seed in range(runs):
             x = np.random.default_rng([17, seed]).normal(size=4) * [0.1, 20.0, 20.0, math.radians(0.1)]
-            b = Offset((10e3, 5e3), *x.tolist(), sigma=(40.0, 3.0), **how)  # type: ignore[misc]
+            clock, east, north, heading = x.tolist()
+            b = Offset((10e3, 5e3), clock, east, north, heading, sigma=(40.0, 3.0), **how)
             a = Offset((-20e3, -10e3), **how)
             world = World({"a": a, "b": b}, 15, seed=seed, **RULED, **BY_A)
             world.run(seconds)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 
@@ -56,12 +57,12 @@ class Applied:
         ]  # fmt: skip
 
     @classmethod
-    def unpacked(cls, packed: list[object]) -> Applied:
+    def unpacked(cls, packed: list[Any]) -> Applied:
         """From what `packed` gave."""
         found, on, loose, looks, *parts = packed
         like = np.zeros(0)
-        value, covariance, told, sigma = (from_bytes(one, like) for one in parts)  # type: ignore[arg-type]
-        return cls(bool(found), bool(on), bool(loose), int(looks), value, covariance.reshape(P, P), told, sigma)  # type: ignore[call-overload]
+        value, covariance, told, sigma = (from_bytes(one, like) for one in parts)
+        return cls(bool(found), bool(on), bool(loose), int(looks), value, covariance.reshape(P, P), told, sigma)
 
 
 def decide(before: Applied, told: Told, effect: Floats, errors: float, corrects: bool) -> tuple[Applied, bool]:

@@ -12,8 +12,8 @@
     two-runs        two runs of one source speak at once: every other message is older than the last
     older-run       the same, of which one says that it began earlier: what it sends is refused (old-epoch)
 
-Alarms change no result by themselves: they stand in log and status, and `alarmed` tells the states of sources of all
-but the last kind: refused messages are not in a recording, and what changes a result must be.
+Alarms change no result by themselves: they stand in log and status. Only a source that is `stuck` as a whole is out,
+and one that `jumped` as a whole is registered anew (see `supervisor`).
 """
 
 from __future__ import annotations
@@ -281,10 +281,6 @@ class Conduct:
         born = dict(zip(picture.id[sure].tolist(), picture.born[sure].tolist(), strict=True))
         self._alone = {track: min(self._alone.get(track, time), time) for track, time in born.items()}
         return [(int(k), names[int(low[k])], float(total[k]), int(others[k])) for k in sure.tolist()]
-
-    def alarmed(self, name: str) -> str:
-        """What an alarm that stands says of a source; "" where none does."""
-        return next(iter(self._warnings.of(name, but=REFUSED)), "")
 
     def jumped(self, name: str, time: int) -> bool:
         """Whether all its tracks jumped in the step at `time`, ns, and did not just before."""

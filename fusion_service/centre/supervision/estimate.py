@@ -11,6 +11,7 @@ covariance W_i^-1 and nothing known of u, eliminating u leaves exactly
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -171,15 +172,14 @@ class Information:
         return [list(self.names), self.pending, *(to_bytes(one) for one in (self.matrix, self.vector, self.shared))]
 
     @classmethod
-    def unpacked(cls, packed: list[object]) -> Information:
+    def unpacked(cls, packed: list[Any]) -> Information:
         """From what `packed` gave."""
         names, pending, *parts = packed
-        made = cls(tuple(str(name) for name in names))  # type: ignore[attr-defined]
-        made.pending = float(pending)  # type: ignore[arg-type]
+        made = cls(tuple(str(name) for name in names))
+        made.pending = float(pending)
         like = (made.matrix, made.vector, made.shared)
         made.matrix, made.vector, made.shared = (
-            from_bytes(part, one).reshape(one.shape)  # type: ignore[arg-type]
-            for part, one in zip(parts, like, strict=True)
+            from_bytes(part, one).reshape(one.shape) for part, one in zip(parts, like, strict=True)
         )
         return made
 

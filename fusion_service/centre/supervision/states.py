@@ -5,7 +5,7 @@ watch     told, and nothing done: a deviation below `TREATED`, or one that canno
 inflated  its variances are multiplied by the factors found, for positions and for the rest.
 union     it contradicts another source and it cannot be told which of them is right: where both have a target, their
           tracks are fused by covariance union, which is conservative if one of them is.
-out       it cannot be made right by `MOST`, or is alarmed about for its conduct: watched, linked, and not fused.
+out       it cannot be made right by `MOST`, or is stuck as a whole: watched, linked, and not fused.
 
 A source goes up as soon as a bound is passed, and down when its factor has been below `OVER` for `CALM` seconds; the
 factors that are applied follow the estimate when they are off by more than `STEP`. An

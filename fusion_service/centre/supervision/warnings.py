@@ -58,11 +58,9 @@ class Warnings:
                 over = {"kind": "alarm_over", "what": key[1], "source": key[0]} | ({"of": key[2]} if key[2] else {})
                 journal.event(over | {"seconds": (one.last - one.since) / 1e9})
 
-    def of(self, source: str, but: str = "") -> list[str]:
-        """The sentences of a source, the longest standing first. but: leave out what is this."""
-        mine = [
-            (one.since, key, one.sentence) for key, one in self._standing.items() if key[0] == source and key[1] != but
-        ]
+    def of(self, source: str) -> list[str]:
+        """The sentences of a source, the longest standing first."""
+        mine = [(one.since, key, one.sentence) for key, one in self._standing.items() if key[0] == source]
         return [sentence for _, _, sentence in sorted(mine)[:SHOWN]]
 
     def begun(self, key: Key) -> int:
