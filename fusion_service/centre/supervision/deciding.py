@@ -8,7 +8,7 @@ from fusion_service.arrays import Bools, Floats
 from fusion_service.centre.supervision.hat import Factors, Pairs, decidable
 from fusion_service.centre.supervision.scale import high_bound
 
-__all__ = ["MATTERS", "beyond", "mean_scale", "pair_beyond", "unexplained", "with_innovations"]
+__all__ = ["MATTERS", "beyond", "contradicted", "mean_scale", "pair_beyond", "unexplained", "with_innovations"]
 
 MATTERS = 1.25
 """A factor on variances below which nothing is said, though it may be no chance."""
@@ -19,8 +19,7 @@ def with_innovations(pairs: Pairs, S: int, own: list[tuple[int, float, float]], 
     (S,) it is known then. Only of sources that contradict another: innovations depend on the motion that is declared
     too, and tell which of two is wrong, not whether one is."""
     sure, k = decidable(pairs, S), pairs.k
-    suspect = pair_beyond(pairs, z)
-    against = np.isin(np.arange(S), np.concatenate([pairs.first[suspect], pairs.second[suspect]]))
+    against = contradicted(pairs, pair_beyond(pairs, z), S)
     open_ = [one for one in own if against[one[0]] and not sure[one[0]]]
     if not open_:
         return pairs, sure
@@ -30,11 +29,19 @@ def with_innovations(pairs: Pairs, S: int, own: list[tuple[int, float, float]], 
     return pairs, decidable(pairs, S)
 
 
-def beyond(found: Factors, z: float) -> Bools:
-    """Whose factors (S,) are above 1 by more than chance, and more than matters."""
+def beyond(found: Factors, z: float, against: Bools) -> Bools:
+    """Whose factors (S,) are above 1 by more than chance, and more than matters, of those `against` whom (S,) another
+    speaks at all: where every pair differs no more than both say, as with errors that all have in common, the factors
+    that explain the pairs best may be above 1 only because others are held at 0."""
     freedom = np.maximum(found.freedom, 0.2)
     skewed = (high_bound(freedom, z) - 1.0) / np.sqrt(2.0 / freedom)
-    return np.asarray((found.value > MATTERS) & (found.value - 1.0 > np.maximum(skewed, z) * found.sigma))
+    more = (found.value > MATTERS) & (found.value - 1.0 > np.maximum(skewed, z) * found.sigma)
+    return np.asarray(more & against)
+
+
+def contradicted(pairs: Pairs, suspect: Bools, S: int) -> Bools:
+    """Which sources (S,) are in a `suspect` pair."""
+    return np.isin(np.arange(S), np.concatenate([pairs.first[suspect], pairs.second[suspect]]))
 
 
 def unexplained(pairs: Pairs, value: Floats, suspect: Bools) -> Bools:
@@ -45,7 +52,7 @@ def unexplained(pairs: Pairs, value: Floats, suspect: Bools) -> Bools:
     some = suspect & (pairs.scale > MATTERS * explained)
     S, real = len(value), pairs.first != pairs.second
     alone = ~decidable(pairs.take(real), S)
-    return alone & np.isin(np.arange(S), np.concatenate([pairs.first[some], pairs.second[some]]))
+    return alone & contradicted(pairs, some, S)
 
 
 def pair_beyond(pairs: Pairs, z: float) -> Bools:

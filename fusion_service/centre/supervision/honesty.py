@@ -21,7 +21,14 @@ from fusion_service.arrays import Bools, Floats, Ints, from_bytes, to_bytes
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.supervision.beside import Beside
-from fusion_service.centre.supervision.deciding import beyond, mean_scale, pair_beyond, unexplained, with_innovations
+from fusion_service.centre.supervision.deciding import (
+    beyond,
+    contradicted,
+    mean_scale,
+    pair_beyond,
+    unexplained,
+    with_innovations,
+)  # fmt: skip
 from fusion_service.centre.supervision.hat import Pairs, solved
 from fusion_service.centre.supervision.scale import BINS, CUT, binned, high_bound, low_bound, robust_scale, sigmas
 from fusion_service.centre.supervision.shared import Shared
@@ -238,9 +245,10 @@ class Honesty:
             pairs, sure = with_innovations(pairs, S, self._innovations(own), z)
             found = solved(pairs, self._factors[block])
             self._factors[block] = found.value
-            suspect = pair_beyond(pairs, z) & (pairs.first != pairs.second)
+            beside = pairs.first != pairs.second
+            suspect = pair_beyond(pairs, z) & beside
             sure = sure & ~unexplained(pairs, found.value, suspect)
-            wrong[block] = sure & beyond(found, z)
+            wrong[block] = sure & beyond(found, z, contradicted(pairs, suspect, S))
             for side in (pairs.first, pairs.second):
                 np.maximum.at(doubted[block], side[suspect], pairs.scale[suspect])
             doubted[block, sure] = 1.0

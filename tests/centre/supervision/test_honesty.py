@@ -15,7 +15,7 @@ import schemas
 from fusion_service.arrays import Floats
 from fusion_service.centre import FusionCentre, Order, StepResult
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.supervision.deciding import with_innovations
+from fusion_service.centre.supervision.deciding import beyond, contradicted, pair_beyond, with_innovations
 from fusion_service.centre.supervision.hat import Pairs, decidable, solved
 from fusion_service.centre.supervision.honesty import Honesty, Opinion
 from fusion_service.centre.supervision.scale import BINS, binned, high_bound, low_bound, robust_scale, sigmas
@@ -121,6 +121,29 @@ def test_many_sources_are_solved_in_parts_that_agree() -> None:
     assert value.argmax() == 7
     assert value[7] == pytest.approx(9.0, rel=0.3)
     assert np.abs(np.delete(value, 7) - 1.0).max() < 0.6
+
+
+def test_trackers_that_began_with_one_guess_contradict_nobody() -> None:
+    """Velocities that all trackers first take for 0 +- 20 m/s have one error in common, and the source that knows them
+    best is beside others of which the one makes up for the other: no pair differs by more than it says, no one is
+    wrong."""
+    rng = np.random.default_rng(SEED)
+    sigma, R, z = np.array([0.2, 0.45, 1.0]), 60, sigmas(1e-6)  # of what is known of it, in units of the first guess
+    variance = sigma**2
+    i, j = np.triu_indices(3, 1)
+    share = variance[i] / (variance[i] + variance[j])
+    alone = 0
+    for _ in range(50):
+        guess = rng.normal(size=(1, R, 2))
+        noise = rng.normal(size=(3, R, 2)) * np.sqrt(variance * (1.0 - variance))[:, None, None]
+        errors = noise - variance[:, None, None] * guess
+        scale = ((errors[i] - errors[j]) ** 2).mean(axis=(1, 2)) / (variance[i] + variance[j])
+        pairs = Pairs(i, j, scale, share, np.full(3, float(R)), 2)
+        found = solved(pairs, np.ones(3))
+        alone += int(beyond(found, z, np.ones(3, dtype=np.bool_)).any())
+        assert not beyond(found, z, contradicted(pairs, pair_beyond(pairs, z), 3)).any()
+    print(f"seed {SEED}: the factors alone speak against one in {alone} of 50")
+    assert alone > 3
 
 
 # ------------------------------------------------------------------ in a centre

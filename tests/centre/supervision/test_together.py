@@ -85,7 +85,7 @@ def test_a_source_that_is_corrected_is_judged_anew() -> None:
     _, results = flown(bad, "abc", 40, registration="correct")
     begun = next(i for i, one in enumerate(results) if one.status.sources["b"]["bias_applied"])
     assert begun < 12
-    assert set(states(results, "b")[begun + 15 :]) == {"trusted"}
+    assert set(states(results, "b")[20:]) == {"trusted"}
     ids = [frozenset(one.tracks.ids[one.tracks.status == CONFIRMED].tolist()) for one in results[begun:]]
     assert ids[-1] <= ids[0], "no id begins with the correction"
 
