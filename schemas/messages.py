@@ -200,6 +200,7 @@ class GlobalTracks(Header):
     identity, kind: what it is, a text or None per track, with the probabilities identity_p and kind_p (T,);
     track_origin (T,) u8 index into `ORIGINS`; marks (T,) u8, bits of `MARKS`; number (T,) u32 and callsign: how
     an operator has named it (0, None: not). extent, extent_sigma (T, 3), shape: fused, as in `LocalTracks`.
+    delta: these are only the tracks that have changed since the last picture (see `schemas.merged`); None: all.
     """
 
     type: ClassVar[str] = "global_tracks"
@@ -238,6 +239,7 @@ class GlobalTracks(Header):
     extent: Floats | None = None
     extent_sigma: Floats | None = None
     shape: str | None = None
+    delta: bool | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -171,6 +171,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _EXTENT,
         _SIGMA,
         _SHAPE,
+        _plain("delta", values.boolean, optional=True),
     ),
     StepLog: (
         *_HEADER,

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
+from fusion_service.centre.deltas import Deltas, fed
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
-from fusion_service.centre.events import Event
+from fusion_service.centre.events import Event, Skipped
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal, start_event
@@ -43,11 +44,12 @@ __all__ = ["Centre", "StepResult"]
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """What one step gives."""
+    """What one step gives. tracks: as they are published, which may be a delta; picture: all of them."""
 
     tracks: GlobalTracks
     log: StepLog
     status: Status
+    picture: GlobalTracks
 
 
 class Centre(ABC):
@@ -79,6 +81,7 @@ class Centre(ABC):
         self._time = -1
         self._journal = Journal(self.config.name, self.config_hash, __version__)
         self._era = EraWatch(self.config)
+        self._deltas = Deltas(self.config)
         self._begin()
         if checkpoint is not None:
             state, self._picture = unpack_state(checkpoint, self._intake, self._labels)
@@ -104,7 +107,9 @@ class Centre(ABC):
         era = self._era.judge(event, received, self._time)
         if era is not None:
             self._begin_era(era, received)
-        if not isinstance(event, (ClockSet, NewEra)):
+        if isinstance(event, Skipped):
+            self._journal.event({"kind": "skipped", "steps": event.steps})
+        elif not isinstance(event, (ClockSet, NewEra)):
             self._intake.put(event, received)
 
     def _begin_era(self, time: int, now: int) -> None:
@@ -135,7 +140,7 @@ class Centre(ABC):
         gone_on = heirs(journal.ended())
         self._intake.orders.follow(gone_on)
         self._labels.follow(rows, self._picture, names, gone_on, time, journal)
-        tracks = picture_message(
+        picture = picture_message(
             self._picture,
             self._intake,
             journal,
@@ -147,11 +152,12 @@ class Centre(ABC):
             time=time,
             rule=self._rule,
         )
+        tracks = self._deltas.of(picture, fed(self._intake.sources.values()))
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         notes = self._era.notes(time)
         status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), notes, self._watched())
-        return StepResult(tracks, log, status)
+        return StepResult(tracks, log, status, picture)
 
     def refusals(self) -> dict[str, int]:
         """Refusals by reason since the start, those included that no step has told yet."""

@@ -115,7 +115,13 @@ class CentreConfig:
     frame: Frame | None = _setting(None, read_frame, "frame of the picture; left out: what sources agree on")
     frame_wait: float = _setting(5.0, DURATION, "seconds after which the most supported frame is taken")
     clock: str = _setting("wall", choice("wall", "message"), "step by wall clock, or by the messages' own time")
-    period: float = _setting(1.0, number(0.01, 1e5), "seconds between steps")
+    trigger: str = _setting(
+        "period", choice("period", "arrival"), "step every period, or as soon as a scan is in, at the scan's time"
+    )
+    arrival_spacing: float = _setting(
+        0.002, number(0.0, 10.0), "trigger = arrival: seconds between steps at least; scans that come together are one"
+    )
+    period: float = _setting(1.0, number(0.01, 1e5), "seconds between steps; trigger = arrival: between full pictures")
     delay: float = _setting(0.5, DURATION, "wall clock: how far behind now a step is")
     lateness: float = _setting(5.0, DURATION, "how late a message may be, seconds")
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
