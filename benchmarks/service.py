@@ -43,7 +43,7 @@ from fusion_service.demo.crew import free_endpoint
 from fusion_service.rules import fuse_last
 from fusion_service.service.daemon import run_service
 
-__all__ = ["Burst", "Report", "Way", "measure"]
+__all__ = ["Burst", "Report", "Way", "measure", "setting"]
 
 WARM = 3.0
 LOOKED = 2.0
@@ -367,7 +367,7 @@ def _compared(picture: schemas.GlobalTracks, world: World, start: int) -> tuple[
     return int((count == 0).sum()), int(np.maximum(count - 1, 0).sum()) + int((far >= reach).sum())
 
 
-def value(text: str) -> tuple[str, Any]:
+def setting(text: str) -> tuple[str, Any]:
     """KEY=VALUE, the value as JSON where it is."""
     key, _, rest = text.partition("=")
     try:
@@ -386,7 +386,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=15.0)
     parser.add_argument("--runs", type=int, default=1)
     parser.add_argument("--burst", type=Burst.read, default=Burst(0.0, 0.0, 1.0), help="BEGIN:SECONDS:FACTOR")
-    parser.add_argument("--set", type=value, action="append", default=[], help="KEY=VALUE under [centre]")
+    parser.add_argument("--set", type=setting, action="append", default=[], help="KEY=VALUE under [centre]")
     given = parser.parse_args()
     load = Load(given.sources, given.tracks, given.overlap, given.rate)
     way = Way(load, given.seconds, dict(given.set), given.burst)
