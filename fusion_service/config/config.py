@@ -45,6 +45,10 @@ from schemas import ORIGINS, STATUSES, Coverage, Frame, Height, Motion, check_na
 __all__ = ["BusConfig", "CentreConfig", "ConfigError", "DaemonConfig", "ServiceConfig", "SourceConfig", "config_hash"]
 
 
+LATER = ("trigger", "arrival_spacing")
+"""Settings that came after hashes were recorded; their defaults are what there was before."""
+
+
 class ConfigError(FusionError, ValueError):
     """A config that cannot be used; `problems` has one line per error, which begins with where it is."""
 
@@ -264,8 +268,12 @@ class ServiceConfig:
 
 
 def config_hash(config: CentreConfig) -> str:
-    """A short hash of all settings: equal for equal settings."""
-    plain = json.dumps(dataclasses.asdict(config), sort_keys=True, default=_plain)
+    """A short hash of all settings: equal for equal settings. Those that came later count where they are not as ever."""
+    settings = dataclasses.asdict(config)
+    for one in dataclasses.fields(config):
+        if one.name in LATER and settings[one.name] == one.default:
+            del settings[one.name]
+    plain = json.dumps(settings, sort_keys=True, default=_plain)
     return hashlib.sha256((plain + str(getattr(config.frame, "kind", ""))).encode()).hexdigest()[:16]
 
 
