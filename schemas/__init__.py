@@ -1,7 +1,7 @@
 """What crosses the bus: state spaces, messages, codec, key expressions. WIRE.md says it in words."""
 
 from schemas.codec import MAX_BYTES, VERSION, decode, digest, encode
-from schemas.deltas import merged, tracks_at
+from schemas.deltas import Wholes, merged, tracks_at
 from schemas.errors import REASONS, FusionError, MessageError
 from schemas.extents import MAX_EXTENT, REFERENCES, SHAPES
 from schemas.keys import (
@@ -90,6 +90,7 @@ __all__ = [
     "Status",
     "StepLog",
     "Truth",
+    "Wholes",
     "centre_source",
     "check_name",
     "check_numbers",

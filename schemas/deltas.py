@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 
 from schemas.messages import ORIGINS, GlobalTracks
 
-__all__ = ["merged", "tracks_at"]
+__all__ = ["Wholes", "merged", "tracks_at"]
+
+MOST_CENTRES = 64
 
 TEXTS = ("identity", "kind", "callsign")
 PER_TRACK = ("ids", "status", "existence", "updated", "contributor_counts")
@@ -28,6 +30,20 @@ OPTIONAL: dict[str, tuple[Any, Any, tuple[int, ...]]] = {
 }
 """Columns that may be absent: their type, what absence means, and their numbers a track."""
 PER_CONTRIBUTION = ("contributor_source", "contributor_epoch", "contributor_id", "contributor_influence")
+
+
+class Wholes:
+    """The whole picture of each centre, of at most `MOST_CENTRES`."""
+
+    def __init__(self) -> None:
+        self._newest: dict[str, GlobalTracks] = {}
+
+    def of(self, message: GlobalTracks) -> GlobalTracks | None:
+        """The whole after the next picture of a centre, as `merged` has it."""
+        whole = merged(self._newest.get(message.source), message)
+        if whole is not None and (message.source in self._newest or len(self._newest) < MOST_CENTRES):
+            self._newest[message.source] = whole
+        return whole
 
 
 def merged(before: GlobalTracks | None, message: GlobalTracks) -> GlobalTracks | None:

@@ -268,7 +268,8 @@ class ServiceConfig:
 
 
 def config_hash(config: CentreConfig) -> str:
-    """A short hash of all settings: equal for equal settings. Those that came later count where they are not as ever."""
+    """A short hash of all settings: equal for equal settings. Those of `LATER` count where they are not as
+    ever."""
     settings = dataclasses.asdict(config)
     for one in dataclasses.fields(config):
         if one.name in LATER and settings[one.name] == one.default:
