@@ -42,7 +42,8 @@ def drawn(rng: random.Random, ids: list[int], rich: bool, **more: Any) -> Global
     return GlobalTracks(
         source="c", epoch=5, seq=1, sent=1, time=rng.randrange(10**9), step=1, rule="ci", space=("x", "y"),
         frame=schemas.Local("here"), ids=np.array(ids, dtype=np.uint64),
-        status=draw.integers(0, 3, count).astype(np.uint8), existence=draw.uniform(size=count), means=draw.normal(size=(rows, 2)),
+        status=draw.integers(0, 3, count).astype(np.uint8), existence=draw.uniform(size=count),
+        means=draw.normal(size=(rows, 2)),
         covariances=np.tile(np.eye(2), (rows, 1, 1)) * draw.uniform(1, 2, (rows, 1, 1)),
         updated=draw.integers(0, 9, count), sources=sources, contributor_counts=given,
         contributor_source=draw.integers(0, len(sources), total).astype(np.uint16),
