@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,7 +109,7 @@ class Tracks:
 
     def take(self, rows: Any) -> Tracks:
         """The given rows (indices or a mask); the same where the mask holds for all."""
-        return taken(self, rows)
+        return cast(Tracks, taken(self, rows))
 
     def mixtures(self, rows: Any) -> Mixtures:
         """The densities of the given rows as mixtures."""
