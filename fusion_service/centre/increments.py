@@ -34,6 +34,8 @@ process noise that is declared a tenth too small."""
 RIDGE = 0.05
 """Of P_-, added to P_- - P, which has the rank of the measurement only: directions in which less than that is gained
 count for little, so that a process noise declared a tenth too large does not count as freedom."""
+DEFINITE = 1e-14
+"""Margin from which a covariance is positive definite, as in `linalg`."""
 LITTLE = 0.5
 """An innovation of less freedom says nothing."""
 LARGEST = 50.0
@@ -80,11 +82,12 @@ def _of_block(versions: Versions) -> tuple[Floats, Floats, Floats, Floats, Bools
         vector = linalg.matvec(new, step)
         gained = before - after
         ridged = gained + RIDGE * before
-        freedom = linalg.inner(linalg.inverse(ridged), gained)
+        inverse, _, third = linalg.sweep(ridged)
+        freedom = linalg.inner(inverse, gained)
         innovation = np.minimum(linalg.quadratic(ridged, step), LARGEST * np.maximum(freedom, 1.0))
         sound = (np.minimum(first, second) > 0) & np.isfinite(vector).all(axis=0)
         sound &= np.isfinite(information).all(axis=(0, 1))
         sound &= linalg.is_positive_definite(information + NEGATIVE * old)
-        judged = np.isfinite(innovation) & np.isfinite(freedom) & linalg.is_positive_definite(ridged)
+        judged = np.isfinite(innovation) & np.isfinite(freedom) & (third > DEFINITE)
         counted = judged & (freedom > LITTLE)
     return information, vector, np.where(counted, innovation, 0.0), np.where(counted, freedom, 0.0), sound & judged
