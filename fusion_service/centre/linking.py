@@ -29,6 +29,7 @@ from fusion_service.centre.ids import Ids
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.meeting import Meeting
+from fusion_service.centre.neighbours import Neighbours
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.tracks import set_links
 from fusion_service.config import CentreConfig
@@ -55,6 +56,7 @@ class Linker:
         self.merges = PairEvidence()
         self.rivals = RivalLinks()
         self.copies = Copies(config)
+        self._beside = Neighbours()
         self._ids = ids
         self._settings = Settings(self.tests, config.space, config.manoeuvre)
         n = len(config.space)
@@ -71,7 +73,7 @@ class Linker:
         """
         meeting.settle(step, journal)
         judged = judge(rows, now, meeting.forced_row, time, self._settings, journal)
-        near = find_candidates(rows, now, meeting, judged, self.tests, self._places)
+        near = find_candidates(rows, now, meeting, judged, self.tests, self._places, self._beside)
         near = _without_broken(near, rows, now, judged)
         joined = self._assign(rows, now, _vacant(near, meeting), step, journal)
         merged = self._merge(rows, now, near, step, journal)
@@ -198,6 +200,8 @@ class Linker:
     def _shadow(self, rows: Rows, now: Picture, near: Candidates, meeting: Meeting, free: Ints) -> Bools:
         """Hold loose rows whose source already follows the track that they are near; (F,) which may begin one."""
         tracks, tests = rows.tracks, self.tests
+        if not len(free):
+            return np.zeros(0, dtype=np.bool_)
         joins = near.joins.take(np.isin(near.joins.first, free))
         holds = _held(rows, now, joins.first, joins.second)
         joins = joins.take(holds)
@@ -311,6 +315,8 @@ def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgemen
 
 def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
     """Which of the pairs (row, track): the row's source has another, believed row in the track."""
+    if not len(row):
+        return np.zeros(0, dtype=np.bool_)
     inside = rows.inside()
     width = max(len(now.id), 1)
     keys = np.unique(rows.source[inside] * width + now.find(rows.tracks.link[inside]))
