@@ -265,16 +265,19 @@ class Linker:
     def _merge(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> dict[int, int]:
         """Join global tracks that share no source and that the evidence says are one: {newer id: older id}."""
         pairs = near.tracks
-        masks = _masks(rows, now)
-        apart = (masks[pairs.first] & masks[pairs.second]) == 0
-        pairs = pairs.take(apart)
+        if len(pairs.first):
+            masks = _masks(rows, now)
+            pairs = pairs.take((masks[pairs.first] & masks[pairs.second]) == 0)
         same = self.tests.sameness(pairs.distance, pairs.size)
         self.merges.add(pairs.first, pairs.second, same, now, self.tests.bound)
-        far = dict(zip(zip(now.id[pairs.first].tolist(), now.id[pairs.second].tolist(), strict=True),
-                       pairs.distance.tolist(), strict=True))  # fmt: skip
+        ripe = self.merges.ripe(self.tests.bound)
+        far: dict[tuple[int, int], float] = {}
+        if ripe:
+            ids = zip(now.id[pairs.first].tolist(), now.id[pairs.second].tolist(), strict=True)
+            far = dict(zip(ids, pairs.distance.tolist(), strict=True))
         merged: dict[int, int] = {}
         taken: set[int] = set()
-        for old, new in self.merges.ripe(self.tests.bound):
+        for old, new in ripe:
             if not taken & {old, new}:
                 taken |= {old, new}
                 merged[new] = old
