@@ -6,7 +6,12 @@ from collections.abc import Callable
 from functools import wraps
 from typing import Any, ParamSpec, TypeVar, cast
 
-__all__ = ["FAST", "either"]
+import numpy as np
+from numpy.typing import NDArray
+
+__all__ = ["FAST", "Floats", "either"]
+
+Floats = NDArray[np.float64]
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion_service.arrays import Floats
+from fusion_service.compiled.either import Floats
 
 __all__ = ["LANES", "congruence", "congruence_each", "inner", "invert", "ldl", "matvec", "pivots", "product", "solve"]
 

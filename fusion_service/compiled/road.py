@@ -10,15 +10,16 @@ import inspect
 import os
 import threading
 from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 from fusion_service.compiled import kernels
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
-from fusion_service.errors import FusionError
 
-__all__ = ["CHOICES", "VARIABLE", "RoadError", "road", "use", "warm_up"]
+__all__ = ["CHOICES", "PLAIN", "VARIABLE", "begin", "is_kept", "road", "use"]
 
 CHOICES = ("auto", "on", "off")
 VARIABLE = "FUSION_COMPILED"
@@ -28,64 +29,81 @@ _LOCK = threading.Lock()
 _NAME = [PLAIN]
 
 
-class RoadError(FusionError, ValueError):
-    """The compiled road is asked for and cannot be taken: why, in one line."""
-
-
 def road() -> str:
     """The road that is taken: "plain", or the compiler and its version."""
     return _NAME[0]
 
 
-def use(choice: str = "auto") -> str:
+def use(choice: str = "auto", stop: threading.Event | None = None) -> str:
     """Take the compiled road if `choice` is "on", or "auto" and numba is there; the plain one if "off". Returns
-    `road()`. Compiles what no earlier process has: up to a minute, once. `RoadError` where "on" cannot be had."""
-    if choice not in CHOICES:
-        raise RoadError(f"compiled {choice!r}: one of {', '.join(CHOICES)}")
-    if choice == "auto":
-        choice = os.environ.get(VARIABLE) or choice
+    `road()`. Compiles what no earlier process has: up to a minute, once; given up between two functions once `stop` is
+    set. `ValueError` where "on" cannot be had."""
+    choice = _chosen(choice)
     with _LOCK:
         if choice == "off":
             FAST.clear()
             _NAME[0] = PLAIN
         elif _NAME[0] == PLAIN:
-            name, compiled = _compiled(choice == "on")
+            name, compiled = _compiled(choice == "on", stop)
             if compiled is not None:
                 FAST.update(functions(compiled))
                 _NAME[0] = name
         return road()
 
 
-def warm_up(choice: str, told: Callable[[str], None]) -> threading.Thread:
-    """`use(choice)` in a thread of its own, while work goes on by the plain road; says by `told` which road it is."""
+def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> None:
+    """`use(choice)`, and say by `told` which road is taken: at once where all is compiled already, or "on" is wanted;
+    else in a thread, while work goes on by the plain road. `ValueError` where "on" cannot be had."""
+    if _chosen(choice) in ("on", "off") or is_kept() or not _installed():
+        told(use(choice, stop))
+        return
+    told(f"{PLAIN}, until the compiler is done")
 
     def run() -> None:
         try:
-            told(use(choice))
-        except RoadError as error:
-            told(f"{PLAIN}: {error}")
+            told(use(choice, stop))
+        except Exception as error:
+            told(f"{PLAIN}: {type(error).__name__}: {error}")
 
-    thread = threading.Thread(target=run, name="compile", daemon=True)
-    thread.start()
-    return thread
+    threading.Thread(target=run, name="compiler").start()
 
 
-def _compiled(wanted: bool) -> tuple[str, SimpleNamespace | None]:
+def is_kept() -> bool:
+    """Whether an earlier process has compiled, as far as one can see beside the kernels."""
+    return any((Path(kernels.__file__).parent / "__pycache__").glob("kernels.*.nbi"))
+
+
+def _installed() -> bool:
+    return find_spec("numba") is not None
+
+
+def _chosen(choice: str) -> str:
+    if choice == "auto":
+        choice = os.environ.get(VARIABLE) or choice
+    if choice not in CHOICES:
+        raise ValueError(f"compiled {choice!r}: one of {', '.join(CHOICES)}")
+    return choice
+
+
+def _compiled(wanted: bool, stop: threading.Event | None) -> tuple[str, SimpleNamespace | None]:
     try:
         import numba
     except ImportError as error:
         if wanted:
-            raise RoadError(f"numba cannot be used ({error}): pip install 'track-fusion-centre[fast]'") from None
+            raise ValueError(f"numba cannot be used ({error}): pip install 'track-fusion-centre[fast]'") from None
         return PLAIN, None
-    made = {name: _kernel(numba, getattr(kernels, name)) for name in kernels.__all__ if name != "LANES"}
+    made: dict[str, Any] = {}
+    for name in RESULTS:
+        if stop is not None and stop.is_set():
+            return PLAIN, None
+        made[name] = _kernel(numba, getattr(kernels, name))
     return f"numba {numba.__version__}", SimpleNamespace(**made)
 
 
 def _kernel(numba: Any, function: Callable[..., None]) -> Any:
     """The function, compiled for views of any strides as arguments and contiguous arrays as results."""
-    signature = numba.types.void(
-        *(_type(numba, name, function.__name__) for name in inspect.signature(function).parameters)
-    )
+    names = inspect.signature(function).parameters
+    signature = numba.types.void(*(_type(numba, name, function.__name__) for name in names))
     options = {"error_model": "numpy", "nogil": True}
     try:
         return numba.njit(signature, cache=True, **options)(function)

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.arrays import Floats
+from fusion_service.compiled.either import Floats
 
 __all__ = ["functions"]
 

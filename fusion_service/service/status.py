@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fusion_service.bus import Inbox
+from fusion_service.compiled import road
 from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
@@ -82,6 +83,7 @@ class StatusMaker:
                 "skipped": float(skipped),
                 "behind": float(counts["behind"]),
             },
+            road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
         )
 
