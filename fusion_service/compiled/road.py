@@ -27,6 +27,8 @@ PLAIN = "plain"
 
 _LOCK = threading.Lock()
 _NAME = [PLAIN]
+_MADE: dict[str, Any] = {}
+"""Kernels that this process has compiled."""
 
 
 def road() -> str:
@@ -92,12 +94,12 @@ def _compiled(wanted: bool, stop: threading.Event | None) -> tuple[str, SimpleNa
         if wanted:
             raise ValueError(f"numba cannot be used ({error}): pip install 'track-fusion-centre[fast]'") from None
         return PLAIN, None
-    made: dict[str, Any] = {}
     for name in RESULTS:
         if stop is not None and stop.is_set():
             return PLAIN, None
-        made[name] = _kernel(numba, getattr(kernels, name))
-    return f"numba {numba.__version__}", SimpleNamespace(**made)
+        if name not in _MADE:
+            _MADE[name] = _kernel(numba, getattr(kernels, name))
+    return f"numba {numba.__version__}", SimpleNamespace(**_MADE)
 
 
 def _kernel(numba: Any, function: Callable[..., None]) -> Any:
