@@ -289,7 +289,7 @@ class StepLog(Header):
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Status(Header):
     """Health of a centre. Counters grow since its start; `sources` maps a name to its own small map;
-    `notes` are sentences about the centre that an operator should read."""
+    `notes` are sentences about the centre that an operator should read; `road`: what small matrices are computed by."""
 
     type: ClassVar[str] = "status"
     time: int
@@ -304,6 +304,7 @@ class Status(Header):
     step_time: dict[str, float]
     memory: int | None = None
     notes: tuple[str, ...] | None = None
+    road: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

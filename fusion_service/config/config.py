@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
+from fusion_service.compiled import CHOICES
 from fusion_service.config.correlation import is_derived, rule_options
 from fusion_service.config.readers import (
     DURATION,
@@ -131,6 +132,12 @@ class CentreConfig:
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
     rule: str = _setting("auto", read_rule, "fusion rule (fusion-service rules lists them)")
     rule_options: dict[str, Any] = _setting({}, rule_options, "options of the rule, e.g. {criterion = 'trace'}")
+    weights: str = _setting(
+        "kept",
+        choice("kept", "best"),
+        "rules ci, bci, auto, three sources and more: the best weights in every step, or those of the last one kept "
+        "while within .1 % of the best",
+    )
     mixture_rule: str = _setting("moments", read_mixture_rule, "rule for mixtures; moments: as Gaussians, by the rule")
     mixture_options: dict[str, Any] = _setting({}, table, "options of the mixture rule")
     max_components: int = _setting(8, whole(1, 100), "components kept of a mixture")
@@ -256,6 +263,11 @@ class DaemonConfig:
     state: str | None = _setting(None, maybe(text), "folder for ids and checkpoint; left out: ids by clock, no memory")
     status_period: float = _setting(1.0, number(0.1, 3600), "seconds between status messages")
     log_refusals: float = _setting(1.0, number(0.0, 1000), "log lines about refusals per second and reason at most")
+    compiled: str = _setting(
+        "auto",
+        choice(*CHOICES),
+        "small matrices by loops that numba compiles, same bits: auto, where it is installed",
+    )
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,8 @@ from fusion_service.centre import (
     is_picture_of,
     source_of,
 )
-from fusion_service.config import ServiceConfig
+from fusion_service.compiled import begin
+from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
@@ -68,7 +69,12 @@ class Arrival(NamedTuple):
 
 
 def run_service(config: ServiceConfig, stop: threading.Event) -> None:
-    """Run until `stop` is set. Raises `BusError` or `StateError`, which says in one line why it cannot start."""
+    """Run until `stop` is set. Raises `BusError`, `StateError` or `ConfigError`, which says in one line why it
+    cannot start."""
+    try:
+        begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
+    except ValueError as error:
+        raise ConfigError([f"[service] compiled: {error}"]) from None
     with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop) as bus:
         Service(config, bus, state).run(stop)
 

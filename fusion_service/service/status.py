@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fusion_service.bus import Inbox
+from fusion_service.compiled import road
 from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
@@ -98,6 +99,7 @@ class StatusMaker:
                 **({"latency": self._latency} if self._latency is not None else {}),
                 **({"overload": overload} if overload is not None else {}),
             },
+            road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
             notes=self._notes(last, skipped, overload),
         )
