@@ -7,11 +7,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from fusion_service.centre import Order
 from fusion_service.config import CentreConfig
-from fusion_service.service import stepping
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State
@@ -26,7 +26,7 @@ class Made:
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         self.now, self.saved, self.number = 100.0, 0, 0
-        monkeypatch.setattr(stepping.time, "monotonic", lambda: self.now)
+        monkeypatch.setattr("fusion_service.service.stepping.time.monotonic", lambda: self.now)
         self.state = State(folder)
         save = self.state.save
 
@@ -36,8 +36,9 @@ class Made:
 
         monkeypatch.setattr(self.state, "save", counted)
         desk = OrderDesk(lambda order: None)
-        config = CentreConfig(period=0.1, lateness=5.0, coast=0.3, rule="ci")
-        self.lasting = LastingCentre(config, self.state, desk, BoundedLog(1.0), Counter(), lambda: None)
+        self.counts: Counter[str] = Counter()
+        self.config = CentreConfig(period=0.1, lateness=5.0, coast=2.0, rule="ci")
+        self.lasting = LastingCentre(self.config, self.state, desk, BoundedLog(1.0), self.counts, lambda: None)
         self.lasting.handle(info("r", period=0.1), START + 100 * SECOND)
 
     def step(self, *places: float) -> int:
@@ -52,33 +53,58 @@ class Made:
         self.result = made.result
         return self.saved - before
 
+    def again(self) -> LastingCentre:
+        """As after kill -9."""
+        desk = OrderDesk(lambda order: None)
+        return LastingCentre(self.config, self.state, desk, BoundedLog(1.0), Counter(), lambda: None)
+
     def after(self, **how: Any) -> int:
         before = self.saved
         self.lasting.save(**how)
         return self.saved - before
 
 
-def test_births_ends_and_orders_are_on_disk_before_they_are_published(
+def test_what_is_confirmed_and_orders_are_on_disk_before_they_are_published_and_ended_ids_beside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = Made(tmp_path, monkeypatch)
-    assert made.step(0.0) == 1, "the run, and a birth"
-    assert made.step(0.0) == 0
-    assert made.step(0.0, 9000.0) == 1, "a birth"
+    assert made.step(0.0) == 1, "the run"
+    assert made.step(0.0) == 1, "a track is confirmed"
+    assert made.step(0.0, 9000.0) == 0, "a track is born"
+    assert made.step(0.0, 9000.0) == 1, "it is confirmed"
     made.lasting.handle(Order("mute", "other"), START)
     assert made.step(0.0, 9000.0) == 1, "an order"
-    ended = 0
+    ended: list[int] = []
     for _ in range(30):
-        saved = made.step(9000.0)
-        ended += len(made.result.tracks.ended)
-        assert saved == bool(made.result.tracks.ended or made.result.log.events)
-    assert ended == 1
+        assert made.step(9000.0) == 0
+        ended += [track for track, _, _ in made.result.tracks.ended]
+        assert State(tmp_path).ended().tolist() == ended
+    assert len(ended) == 1
+    again = made.again()
+    assert ended[0] not in again.centre.view().ids.tolist()
+    assert made.result.tracks.ids.tolist() == again.centre.view().ids.tolist()
+    made.after(at_once=True)
+    assert State(tmp_path).ended().tolist() == []
+
+
+def test_a_step_that_fails_brings_no_ended_track_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Made(tmp_path, monkeypatch)
+    for _ in range(4):
+        made.step(0.0, 9000.0)
+    gone = made.result.tracks.ids[0]
+    while gone in made.result.tracks.ids:
+        made.step(9000.0)
+    made.lasting.centre.step = None  # type: ignore[method-assign, assignment]
+    made.step(9000.0)
+    assert made.result.tracks.ids.tolist() == [gone + np.uint64(1)]
+    assert made.counts["failed_steps"] == 1
 
 
 def test_the_rest_is_saved_once_a_second_after_publishing_and_at_the_end(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made = Made(tmp_path, monkeypatch)
+    made.step(0.0)
     made.step(0.0)
     assert made.after() == 0, "nothing has changed since"
     saved = []
@@ -90,10 +116,7 @@ def test_the_rest_is_saved_once_a_second_after_publishing_and_at_the_end(
     assert made.after() == 0
     assert made.after(at_once=True) == 1
     assert made.after(at_once=True) == 0
-    config = CentreConfig(period=0.1, lateness=5.0, coast=0.3, rule="ci")
-    desk = OrderDesk(lambda order: None)
-    again = LastingCentre(config, made.state, desk, BoundedLog(1.0), Counter(), lambda: None)
-    assert again.centre.time == made.lasting.centre.time
+    assert made.again().centre.time == made.lasting.centre.time
 
 
 @pytest.fixture
