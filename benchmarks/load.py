@@ -63,9 +63,7 @@ class World:
         self._place = ((cell + rng.uniform(0.3, 0.7, (2, count))) * load.spacing).T
         self._velocity = rng.normal(0.0, 20.0, (count, 2))
         first = np.arange(count) % load.sources
-        self._whose = [
-            np.flatnonzero((number - first) % load.sources < load.overlap) for number in range(load.sources)
-        ]
+        self._whose = [np.flatnonzero((number - first) % load.sources < load.overlap) for number in range(load.sources)]
         self._covariances = [self._drawn(len(whose), rng) for whose in self._whose]
         roots = [np.linalg.cholesky(one) for one in self._covariances]
         self._errors = [

@@ -200,6 +200,7 @@ class GlobalTracks(Header):
     identity, kind: what it is, a text or None per track, with the probabilities identity_p and kind_p (T,);
     track_origin (T,) u8 index into `ORIGINS`; marks (T,) u8, bits of `MARKS`; number (T,) u32 and callsign: how
     an operator has named it (0, None: not). extent, extent_sigma (T, 3), shape: fused, as in `LocalTracks`.
+    revised: time, ns, of the earliest step that was made again before this one, for data that came late; None: none.
     """
 
     type: ClassVar[str] = "global_tracks"
@@ -238,6 +239,7 @@ class GlobalTracks(Header):
     extent: Floats | None = None
     extent_sigma: Floats | None = None
     shape: str | None = None
+    revised: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -171,6 +171,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _EXTENT,
         _SIGMA,
         _SHAPE,
+        _plain("revised", values.nanoseconds, optional=True),
     ),
     StepLog: (
         *_HEADER,
