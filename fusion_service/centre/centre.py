@@ -219,7 +219,8 @@ class Centre(ABC):
         if self._ids.book is not None:
             self._ids.book.again(revision.steps[0].number - 1, revision.tables)
         state = revision.steps[0].state
-        self._intake = Intake(self.config)
+        spared, self._intake = self._intake.spared, Intake(self.config)
+        self._intake.spared = spared
         self._labels = Labels(self._intake)
         self._begin()
         kept, self._picture = unpack_state(state or b"", self._intake, self._labels)
