@@ -12,14 +12,15 @@ tracks otherwise is overdue since the last step that had one. How often the cent
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import find_sorted
 from fusion_service.centre.lineage import NOBODY
-from fusion_service.centre.tracks import as_mixtures, join_tracks, no_parts
+from fusion_service.centre.tracks import as_mixtures, join_tracks, no_parts, taken
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
@@ -69,7 +70,7 @@ class Picture:
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
-        return Picture(*(getattr(self, one.name)[..., rows] for one in fields(self)))
+        return cast(Picture, taken(self, rows))
 
     def mixtures(self, rows: Any) -> Mixtures:
         """The densities of the given rows as mixtures."""
@@ -77,7 +78,7 @@ class Picture:
 
     def find(self, ids: NDArray[np.uint64]) -> NDArray[np.intp]:
         """Rows of ids that are in the picture."""
-        return np.searchsorted(self.id, ids)
+        return find_sorted(self.id, ids)
 
     def join(self, other: Picture) -> Picture:
         """Both; ids of `other` are above all of these."""
