@@ -73,7 +73,8 @@ class Compartments:
 
     def _now(self, ids: Ids, rows: Rows, names: tuple[str, ...]) -> tuple[Origins, Codes]:
         origin, apart = np.zeros(len(ids), dtype=np.uint8), np.full(len(ids), NONE, dtype=np.int32)
-        if not len(ids) or self._is_usual(rows):
+        plain = not (self.origin.any() or rows.tracks.origin.any() or (self.apart != NONE).any())
+        if not len(ids) or (plain and not self._intake.orders.about("quarantine")):
             return origin, apart
         if len(self.track):
             at = np.minimum(find_sorted(self.track, ids), len(self.track) - 1)
@@ -87,11 +88,6 @@ class Compartments:
         np.maximum.at(origin, at, rows.tracks.origin[linked])
         np.minimum.at(apart, at, self._rows_apart(rows, names)[linked])
         return origin, apart
-
-    def _is_usual(self, rows: Rows) -> bool:
-        """Whether all is of the first origin, and nothing in quarantine."""
-        other = rows.tracks.origin.any() or self.origin.any() or (self.apart != NONE).any()
-        return not other and not self._intake.orders.about("quarantine")
 
     def kept(self) -> dict[str, Any]:
         """What a checkpoint holds of it, as plain values."""
