@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -52,6 +53,11 @@ class Unknown:
     @classmethod
     def of(cls, space: tuple[str, ...], speed: float = 100.0, acceleration: float = 20.0) -> Unknown:
         """speed, acceleration: one sigma of what targets may have, m/s, m/s2."""
+        return _unknown_of(tuple(space), speed, acceleration)
+
+    @classmethod
+    def made(cls, space: tuple[str, ...], speed: float, acceleration: float) -> Unknown:
+        """The same, not kept."""
         likely = {"x": 1.0, "y": 1.0, "z": PLAUSIBLE_HEIGHT, "turn_rate": PLAUSIBLE_TURN}
         likely |= dict.fromkeys(("vx", "vy", "vz"), max(speed, 1e-3))
         likely |= dict.fromkeys(("ax", "ay", "az"), max(acceleration, 1e-3))
@@ -98,6 +104,11 @@ class Unknown:
                 count -= missing
                 more = np.where(missing, more + np.log(plausible / np.where(missing, spread[k, k], 1.0)), more)
         return count, more
+
+
+@lru_cache(maxsize=64)
+def _unknown_of(space: tuple[str, ...], speed: float, acceleration: float) -> Unknown:
+    return Unknown.made(space, speed, acceleration)
 
 
 def patterns(known: Bools) -> Iterator[tuple[Ints, Any]]:
