@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.compiled import PLAIN, road
 from fusion_service.config.settings import recordable
 from schemas import Decisions, Entry, StepLog, messages
 
@@ -34,6 +35,8 @@ def start_event(config: CentreConfig, epoch: int, generation: int | None, checkp
         start |= {"checkpoint": checkpoint} if len(checkpoint) <= MOST_LOGGED else {"left_out": len(checkpoint)}
     if generation is not None:
         start["generation"] = generation
+    if road() != PLAIN:
+        start["road"] = road()
     return start
 
 
@@ -63,6 +66,11 @@ class Journal:
     def name_sources(self, names: tuple[str, ...]) -> None:
         """The names that decisions index."""
         self._sources = names
+
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The names that decisions index."""
+        return self._sources
 
     def event(self, event: dict[str, Any]) -> None:
         """Something other than a message that changes results or explains them."""
@@ -138,6 +146,14 @@ class Journal:
         """A global track is no more."""
         self.tracks(messages.DELETED, np.array([track], dtype=np.uint64))
         self._ended.append((track, reason, replaced_by))
+
+    def taken(self) -> tuple[Entry, ...]:
+        """The messages used in this step so far."""
+        return tuple(self._taken)
+
+    def not_taken(self) -> tuple[Entry, ...]:
+        """What was refused in it."""
+        return tuple(self._refused)
 
     def ended(self) -> tuple[tuple[int, str, int | None], ...]:
         return tuple(self._ended)
