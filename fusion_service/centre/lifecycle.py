@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import picked
 from fusion_service.centre.lineage import NOBODY
 from fusion_service.centre.tracks import as_mixtures, join_tracks, no_parts
 from fusion_service.config import CentreConfig
@@ -71,7 +72,7 @@ class Picture:
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
-        return Picture(*(getattr(self, one.name)[..., rows] for one in fields(self)))
+        return Picture(*(picked(getattr(self, one.name), rows) for one in fields(self)))
 
     def mixtures(self, rows: Any) -> Mixtures:
         """The densities of the given rows as mixtures."""
