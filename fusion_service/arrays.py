@@ -15,7 +15,6 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
-
 FEW = 64
 """Below, a search is quicker than a table."""
 SPARSE = 8
@@ -27,7 +26,7 @@ def find_sorted(ids: NDArray[np.uint64], some: NDArray[np.uint64]) -> Ints:
     if len(some) < FEW or not len(ids):
         return np.searchsorted(ids, some)
     first, last = int(ids[0]), int(ids[-1])
-    if last - first >= SPARSE * (len(ids) + len(some)) or last >= 2**64 - 1:
+    if not 0 <= last - first < SPARSE * (len(ids) + len(some)) or last == 2**64 - 1:
         return np.searchsorted(ids, some)
     before = np.zeros(last - first + 2, dtype=np.intp)
     before[(ids - np.uint64(first)).astype(np.intp) + 1] = 1
