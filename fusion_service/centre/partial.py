@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -50,6 +51,7 @@ class Unknown:
     plausible: Floats
 
     @classmethod
+    @cache
     def of(cls, space: tuple[str, ...], speed: float = 100.0, acceleration: float = 20.0) -> Unknown:
         """speed, acceleration: one sigma of what targets may have, m/s, m/s2."""
         likely = {"x": 1.0, "y": 1.0, "z": PLAUSIBLE_HEIGHT, "turn_rate": PLAUSIBLE_TURN}

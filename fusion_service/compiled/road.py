@@ -103,7 +103,7 @@ def _compiled(wanted: bool, stop: threading.Event | None) -> tuple[str, SimpleNa
 
 
 def _kernel(numba: Any, function: Callable[..., None]) -> Any:
-    """The function, compiled for views of any strides as arguments and contiguous arrays as results."""
+    """The function, compiled for contiguous arrays."""
     names = inspect.signature(function).parameters
     signature = numba.types.void(*(_type(numba, name, function.__name__) for name in names))
     options = {"error_model": "numpy", "nogil": True}
@@ -134,5 +134,5 @@ def _type(numba: Any, argument: str, kernel: str) -> Any:
         return types.Array(types.float64, RESULTS[kernel][argument], "C")
     if argument in MATRICES:
         axes = 2 if (kernel, argument) == ("congruence", "F") else 3
-        return types.Array(types.float64, axes, "A", readonly=True)
-    return types.Array(types.float64, 2, "A", readonly=True) if argument in VECTORS else types.boolean
+        return types.Array(types.float64, axes, "C", readonly=True)
+    return types.Array(types.float64, 2, "C", readonly=True) if argument in VECTORS else types.boolean
