@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.compiled.either import Floats
+from fusion_service.compiled.either import Floats, Places
 
 __all__ = ["functions"]
 
@@ -20,7 +20,7 @@ F8 = np.dtype(np.float64)
 
 def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     """By name, over these `kernels` (those of the module, compiled or as they are)."""
-    return {**_inverses(kernels), **_factors(kernels), **_products(kernels)}
+    return {**_inverses(kernels), **_factors(kernels), **_products(kernels), "intersect": _groups(kernels)}
 
 
 def _fits(a: Floats, *others: Floats) -> bool:
@@ -127,3 +127,19 @@ def _products(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
         return out.reshape(m, m, *P.shape[2:])
 
     return {"matvec": matvec, "product": product, "inner": inner, "congruence": congruence}
+
+
+def _groups(kernels: SimpleNamespace) -> Callable[..., Any]:
+    def intersect(x: Floats, P: Floats, rows: Places, others: tuple[Floats, Floats]) -> tuple[Floats, ...] | None:
+        """Of rows (n, M), (n, n, M) in groups (G, k), see `groups.intersect`: mean, covariance and margin of each
+        group, and the margins (M,) of the others of each row, which are written into `others`."""
+        if x.dtype != F8 or P.dtype != F8 or rows.shape[1] < 2:
+            return None
+        n, size = len(x), len(rows)
+        mean, covariance, margin = np.empty((n, size)), np.empty((n, n, size)), np.empty(size)
+        beside = np.empty(x.shape[1])
+        at = np.ascontiguousarray(rows, dtype=np.int64)
+        kernels.intersect(_flat(x, 1), _flat(P, 2), at, mean, covariance, margin, *others, beside)
+        return mean, covariance, margin, beside
+
+    return intersect
