@@ -201,6 +201,7 @@ class GlobalTracks(Header):
     track_origin (T,) u8 index into `ORIGINS`; marks (T,) u8, bits of `MARKS`; number (T,) u32 and callsign: how
     an operator has named it (0, None: not). extent, extent_sigma (T, 3), shape: fused, as in `LocalTracks`.
     delta: these are only the tracks that have changed since the last picture (see `schemas.merged`); None: all.
+    revised: time, ns, of the earliest step that was made again before this one, for data that came late; None: none.
     """
 
     type: ClassVar[str] = "global_tracks"
@@ -240,6 +241,7 @@ class GlobalTracks(Header):
     extent_sigma: Floats | None = None
     shape: str | None = None
     delta: bool | None = None
+    revised: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

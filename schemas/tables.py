@@ -172,6 +172,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _SIGMA,
         _SHAPE,
         _plain("delta", values.boolean, optional=True),
+        _plain("revised", values.nanoseconds, optional=True),
     ),
     StepLog: (
         *_HEADER,

@@ -7,9 +7,11 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Ints
 from fusion_service.centre.candidates import Pairs
+from fusion_service.centre.naming import LocalKey
+from fusion_service.centre.rows import Rows
 from fusion_service.metrics import assign_near
 
-__all__ = ["group"]
+__all__ = ["group", "locals_of"]
 
 
 def group(at: Ints, source: Ints, pairs: Pairs) -> Ints:
@@ -58,3 +60,14 @@ def _by_group(
     total = np.add.reduceat(gain[order], start)
     whole = number == size[unique % width]
     return unique[whole] // width, unique[whole] % width, total[whole] / number[whole]
+
+
+def locals_of(rows: Rows, names: tuple[str, ...], at: Ints, groups: Ints, chosen: Ints) -> list[list[LocalKey]]:
+    """The local tracks, in order, of each of the groups `chosen`; groups (A,): of the rows `at`; names: of sources."""
+    place = dict(zip(chosen.tolist(), range(len(chosen)), strict=True))
+    found: list[list[LocalKey]] = [[] for _ in place]
+    columns = groups, rows.source[at], rows.epoch[at], rows.tracks.id[at]
+    for one, source, epoch, local in zip(*(column.tolist() for column in columns), strict=True):
+        if one in place:
+            found[place[one]].append((names[source], epoch, local))
+    return found

@@ -24,15 +24,18 @@ from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack
 from fusion_service.centre.deltas import Deltas, fed
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
 from fusion_service.centre.events import Event, Skipped
+from fusion_service.centre.history import History, Past
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal, start_event
 from fusion_service.centre.judging import View
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import empty_picture
+from fusion_service.centre.naming import Book
 from fusion_service.centre.obeying import heirs, obey, view_of
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.publishing import Contributions, picture_message
+from fusion_service.centre.revising import Revision
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.status import step_status
 from fusion_service.config import CentreConfig, centre_config, config_hash
@@ -76,6 +79,9 @@ class Centre(ABC):
         self._picture = empty_picture(len(self.config.space))
         self._labels = Labels(self._intake)
         self._ids = Ids()
+        self._history = History(self.config)
+        self._ids.book = Book() if self._history.on else None
+        self._state: bytes | None = None
         self._step = 0
         self._published = 0
         self._time = -1
@@ -111,6 +117,7 @@ class Centre(ABC):
             self._journal.event({"kind": "skipped", "steps": event.steps})
         elif not isinstance(event, (ClockSet, NewEra)):
             self._intake.put(event, received)
+            self._history.note(event, received)
 
     def _begin_era(self, time: int, now: int) -> None:
         self._journal.event(self._era.begin(time, self._time))
@@ -119,27 +126,16 @@ class Centre(ABC):
         self._labels.rebase(time)
         self._picture = rebased(self._picture, GLOBAL_TIMES, time)
         self._rebase(time)
+        self._history.clear()
+        self._state = None
 
     def step(self, time: int) -> StepResult:
         """Make the step at `time`, ns, which must be after the last. `ValueError` if it is not."""
         if time <= self._time:
             raise ValueError(f"a step at {time} is not after the last, at {self._time}")
-        self._step += 1
+        revised = self._revise()
+        contributions = self._make(time)
         journal = self._journal
-        self._obey(self._intake.take_orders(), time)
-        self._forget_lineages()
-        self._intake.admit(time, self._time, journal)
-        self._time = time
-        if self._intake.reframed:
-            self._intake.reframed = False
-            self._end_all(self._picture.id, "frame")
-        rows = usable_rows(self._intake, time, journal)
-        names = self._intake.names()
-        journal.name_sources(names)
-        contributions = self._advance(rows, names, time)
-        gone_on = heirs(journal.ended())
-        self._intake.orders.follow(gone_on)
-        self._labels.follow(rows, self._picture, names, gone_on, time, journal)
         picture = picture_message(
             self._picture,
             self._intake,
@@ -151,13 +147,85 @@ class Centre(ABC):
             step=self._step,
             time=time,
             rule=self._rule,
+            revised=revised,
         )
         tracks = self._deltas.of(picture, fed(self._intake.sources.values()))
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         notes = self._era.notes(time)
         status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), notes, self._watched())
-        return StepResult(tracks, log, status, picture)
+        return StepResult(tracks, log, self._history.told_in(status), picture)
+
+    def _make(self, time: int, events: tuple[tuple[Event, int], ...] | None = None, left: int = 0) -> Contributions:
+        """Make the step at `time`, ns, as far as it changes the state, and remember what went into it. events: of a
+        step that is made again, with `left` more to come; None: those that were queued."""
+        past = self._begin_step(time, self._history.noted() if events is None else events, left)
+        journal = self._journal
+        self._obey(self._intake.take_orders(), time)
+        self._forget_lineages()
+        self._intake.admit(time, self._time, journal)
+        self._history.add(past, self._intake.raw, journal.taken(), owes=events is None)
+        self._time = time
+        if self._intake.reframed:
+            self._intake.reframed = False
+            self._end_all(self._picture.id, "frame")
+        rows = usable_rows(self._intake, time, journal)
+        names = self._intake.names()
+        journal.name_sources(names)
+        contributions = self._advance(rows, names, time)
+        gone_on = heirs(journal.ended())
+        self._intake.orders.follow(gone_on)
+        self._labels.follow(rows, self._picture, names, gone_on, time, journal)
+        return contributions
+
+    def _begin_step(self, time: int, events: tuple[tuple[Event, int], ...], left: int) -> Past:
+        past = Past(self._step + 1, time, self._time, events)
+        if self._history.on:
+            rows = len(self._picture.id) + sum(len(one.tracks.id) for one in self._intake.sources.values())
+            kept = self._history.keeps(self._time, past.number, rows, left)
+            if kept is not None:
+                past.state, past.lasting = self._state or self.checkpoint(), kept
+        self._step, self._state = past.number, None
+        if self._ids.book is not None:
+            self._ids.book.step = past.number
+            self._ids.book.forget(self._history.oldest)
+        return past
+
+    def _revise(self) -> int | None:
+        """Make the steps again that late data belong to. The time of the first that they change, ns; None: nothing is
+        made again."""
+        late = self._history.find(self._intake, self._time) if self._history.on else []
+        start = self._history.start(late) if self._history.on else None
+        if start is None:
+            return None
+        revision = Revision(self._history, start, late, self._intake, self._picture.id, self._ids.next)
+        own, queue = self._journal, revision.left(self._intake.emptied())
+        self._go_back(revision)
+        for place, past in enumerate(revision.steps):
+            self._journal = Journal(self.config.name, self.config_hash, __version__)
+            for event, received in revision.events(past, self._intake, self._picture.id):
+                self._intake.put(event, received)
+            revision.feed(past, self._intake)
+            self._make(past.time, past.events, len(revision.steps) - place - 1)
+            revision.look(past, self._journal)
+        self._journal = own
+        revision.finish(self._intake, queue)
+        if self._ids.book is not None:
+            self._ids.book.done()
+        return revision.tell(own, self._intake, self._picture.id)
+
+    def _go_back(self, revision: Revision) -> None:
+        """To the state before the first of the steps to be made again. Ids go on, and eras."""
+        if self._ids.book is not None:
+            self._ids.book.again(revision.steps[0].number - 1, revision.tables)
+        state = revision.steps[0].state
+        self._intake = Intake(self.config)
+        self._labels = Labels(self._intake)
+        self._begin()
+        kept, self._picture = unpack_state(state or b"", self._intake, self._labels)
+        self._step, self._time = kept["step"], kept["time"]
+        self._restore(kept["own"])
+        self._state = state
 
     def refusals(self) -> dict[str, int]:
         """Refusals by reason since the start, those included that no step has told yet."""
@@ -182,7 +250,8 @@ class Centre(ABC):
             "era": self._era.pack(),
             "own": self._kept(),
         }
-        return pack_state(self.config_hash, state, self._intake, self._labels, self._picture)
+        self._state = pack_state(self.config_hash, state, self._intake, self._labels, self._picture)
+        return self._state
 
     @staticmethod
     @abstractmethod

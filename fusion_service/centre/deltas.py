@@ -1,7 +1,8 @@
 """What is published at a step of a centre that steps when data arrive: the tracks that changed, between full pictures.
 
-A picture is full at the first step of a run, at the first at or after every multiple of `period`, and wherever a delta
-could not say what happened: a track disappears without an end (it left what is published), or the frame changes. A
+A picture is full at the first step of a run, at the first at or after every multiple of `period`, after steps were made
+again for late data, and wherever a delta could not say what happened: a track disappears without an end (it left what
+is published), or the frame changes. A
 track has changed where a local track linked to it came in this step, or where its status, its labels, its newest datum
 or its contributors are others than before (see `schemas.merged` for the reader's side).
 """
@@ -47,7 +48,7 @@ class Deltas:
         if not self._wanted:
             return picture
         before, self._shown = self._shown, picture
-        if before is None or picture.time // self._period != before.time // self._period:
+        if before is None or picture.revised is not None or picture.time // self._period != before.time // self._period:
             return picture
         ended = np.array([track for track, _, _ in picture.ended], dtype=np.uint64)
         gone = np.setdiff1d(before.ids, picture.ids, assume_unique=True)

@@ -138,7 +138,10 @@ class FusionCentre(Centre):
             gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
             self._picture, now = self._picture.take(~gone), now.take(~gone[:count])
             count = len(now.id)
-        return now.join(self._picture.take(slice(count, None)))
+        now = now.join(self._picture.take(slice(count, None)))
+        if (order := now.order()) is not None:  # a step made again gives ids that are known
+            self._picture, now = self._picture.take(order), now.take(order)
+        return now
 
     def _live(self, rows: Rows, shared: Shared, time: int) -> None:
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()

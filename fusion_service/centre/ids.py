@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from numpy.typing import NDArray
+
+from fusion_service.centre.naming import Book, LocalKey, Places
 
 __all__ = ["Ids"]
 
 
 class Ids:
-    """The ids that are given from now on, in order. next: the first of them."""
+    """The ids that are given from now on, in order. next: the first of them. book: the births that may be made again;
+    None where none is."""
 
     def __init__(self) -> None:
         self.next = 1
+        self.book: Book | None = None
 
     def begin(self, generation: int) -> None:
         """Go on with the ids of a generation that was never used."""
         self.next = (generation << 32) + 1
 
-    def allot(self, count: int) -> NDArray[np.uint64]:
-        """So many new ids."""
+    def allot(
+        self, count: int, whom: Callable[[], Sequence[Sequence[LocalKey]] | Places] | None = None
+    ) -> NDArray[np.uint64]:
+        """So many ids, new ones in order, but for tracks that begin again in a step made again. whom: the groups of
+        local tracks that they are for, or the places."""
+        if self.book is None or whom is None or not count:
+            first, self.next = self.next, self.next + count
+            return np.arange(first, self.next, dtype=np.uint64)
+        return np.array(self.book.allot(whom(), self._fresh), dtype=np.uint64)
+
+    def _fresh(self, count: int) -> list[int]:
         first, self.next = self.next, self.next + count
-        return np.arange(first, self.next, dtype=np.uint64)
+        return list(range(first, self.next))

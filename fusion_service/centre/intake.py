@@ -1,9 +1,5 @@
 """From queued events to sources with sound tracks: the border where every input is checked, once.
 
-Reasons of refusal, beside those of `schemas.MessageError` (what cannot be decoded) and `schemas.FAULTS` (bad
-numbers): type, muted, origin, loop, future, old-epoch, repeat, late, space, frame, intensity (or tracks: what this
-centre does not fuse), length, bad-info, too-many-tracks, too-many-sources.
-
 An intensity stands in its source's table as a complete scan: a track per component, its weight as existence.
 """
 
@@ -28,8 +24,9 @@ from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.orders import Orders
-from fusion_service.centre.pictures import as_scan, is_own, is_picture_of, source_of
-from fusion_service.centre.scans import Scan, as_tracks, fits, is_sound, message_tracks, size_of
+from fusion_service.centre.pictures import as_scan, is_picture_of, source_of
+from fusion_service.centre.refusing import fault
+from fusion_service.centre.scans import Scan, as_tracks, message_tracks, size_of
 from fusion_service.centre.sources import Source
 from fusion_service.centre.spared import Spared
 from fusion_service.centre.tracks import Tracks, empty_tracks
@@ -79,7 +76,8 @@ class Intake:
         self.voting = FrameVoting()
         self.reframed = False
         self.sources: dict[str, Source] = {}
-        self._queue: list[_Queued] = []
+        self.queue: list[_Queued] = []
+        self.raw: dict[tuple[str, int, int, int], tuple[Message, int, int]] = {}
         self._held: Counter[str] = Counter()
         self._components = 0
         self.orders = Orders()
@@ -108,12 +106,26 @@ class Intake:
         elif self._is_full(event):
             self._count(source_of(event), "pending", 1, dropped=True)
         else:
-            self._queue.append((event, received))
-            self._held[source_of(event)] += 1
-            self._components += size_of(event)
+            self.hold(event, received)
+
+    def hold(self, event: Message, received: int) -> None:
+        """Queue a message, whatever there is."""
+        self.queue.append((event, received))
+        self._held[source_of(event)] += 1
+        self._components += size_of(event)
+
+    def emptied(self) -> list[_Queued]:
+        """The messages that are queued, which are so no more."""
+        queue, self.queue, self._components = self.queue, [], 0
+        self._held.clear()
+        return queue
+
+    def succeed(self, other: Intake) -> None:
+        """Take over what is queued in `other` beside messages."""
+        self._given, self._present, self._refused = other._given, other._present, other._refused
 
     def _is_full(self, message: Message) -> bool:
-        full = len(self._queue) >= MAX_QUEUED or self._components + size_of(message) > MAX_COMPONENTS
+        full = len(self.queue) >= MAX_QUEUED or self._components + size_of(message) > MAX_COMPONENTS
         return full or self._held[source_of(message)] >= self.config.max_pending
 
     def _count(self, source: str, reason: str, count: int, dropped: bool) -> None:
@@ -124,7 +136,7 @@ class Intake:
 
     def pending(self) -> int:
         """Messages queued."""
-        return len(self._queue)
+        return len(self.queue)
 
     def waiting_refusals(self) -> Counter[str]:
         """Refusals by reason that no step has told yet."""
@@ -181,7 +193,7 @@ class Intake:
         """A new era begins at `time`, ns: nothing that is known is later, nor did it come after `now`."""
         rebase_sources(self.sources.values(), time)
         self.voting.asked = min(self.voting.asked, time)
-        self._queue = [(event, min(received, now)) for event, received in self._queue]
+        self.queue = [(event, min(received, now)) for event, received in self.queue]
 
     def take_orders(self) -> list[Order]:
         """The orders given since the last step, which are obeyed before anything else of it."""
@@ -213,17 +225,14 @@ class Intake:
         self._accept(self._due(time, journal), time, last, journal)
 
     def _due(self, time: int, journal: Journal) -> list[_Keyed]:
-        queue, self._queue, self._components = self._queue, [], 0
-        self._held.clear()
+        queue, self.raw = self.emptied(), {}
         due: list[_Keyed] = []
         for event, received in queue:
             name = source_of(event)
             timed = isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks))
             clock = self.treatment(name).clock
             if timed and time + clock < getattr(event, "time", -1) <= horizon(received, self.config):
-                self._held[name] += 1
-                self._components += size_of(event)
-                self._queue.append((event, received))
+                self.hold(event, received)
                 if name in self.sources:
                     source = self.sources[name]
                     source.ahead = max(source.ahead, getattr(event, "time", -1))
@@ -234,6 +243,7 @@ class Intake:
                 journal.refuse(Entry(name, 0, 0, 0, error.reason))
             else:
                 due.append((key, as_scan(event, self.config, self.frame)))
+                self.raw.setdefault((*key[:3], key[4]), (event, received, getattr(event, "time", received) - clock))
         due.sort(key=lambda item: item[0])
         return due
 
@@ -245,7 +255,13 @@ class Intake:
             source.alive = found
             journal.event({"kind": "found" if found else "lost", "source": name})
 
-    def _new(self, name: str) -> Source:
+    @property
+    def is_full(self) -> bool:
+        """Whether there is no room for another source but in place of one that is dead."""
+        return len(self.sources) >= MAX_SOURCES
+
+    def blank(self, name: str) -> Source:
+        """A source of which nothing is known."""
         source = Source(name, self.config.space, self.nothing())
         source.muted = self.config.source(name).ignore or name in self.orders.about("mute")
         return source
@@ -265,7 +281,7 @@ class Intake:
             if not self._dead:
                 return None
             del self.sources[self._dead.pop()]
-        self.sources[name] = self._new(name)
+        self.sources[name] = self.blank(name)
         return self.sources[name]
 
     def _accept(self, messages: list[_Keyed], time: int, last: int, journal: Journal) -> None:
@@ -273,7 +289,7 @@ class Intake:
         for (name, epoch, seq, kind, code, received), message in messages:
             entry = Entry(name, epoch, seq, code)
             known = self.sources.get(name)
-            reason = self._fault(known or self._new(name), message, code, time, last, received)
+            reason = fault(self, known or self.blank(name), message, code, time, last, received)
             source = None if reason else known or self.admitted(name)
             if source is None:
                 journal.refuse(replace(entry, reason=reason or "too-many-sources"))
@@ -296,33 +312,6 @@ class Intake:
                 source.heard(received, message.time, last)
                 tracks.append((source, message, entry))
         self._apply(tracks, time, journal)
-
-    def _fault(self, source: Source, message: Message, code: int, time: int, last: int, received: int) -> str:
-        if not isinstance(message, (LocalTracks, LocalIntensity, SensorInfo)):
-            return "type"
-        if source.muted:
-            return "muted"
-        if message.origin not in self.config.source(source.name).allowed_origins:
-            return "origin"
-        if is_own(message, self.config):
-            return "loop"
-        holds = getattr(message, "time", -1)
-        started = -1 if message.epoch == source.epoch else message.epoch
-        if max(started, holds) > horizon(received, self.config):
-            return "future"
-        if message.epoch < source.epoch and not self.is_stale(source, time):
-            return "old-epoch"
-        if message.epoch == source.epoch and source.is_repeat(message.type, message.seq, code):
-            return "repeat"
-        if isinstance(message, SensorInfo):
-            return "" if is_sound(message) else "bad-info"
-        if last >= 0 and holds < last - round(self.config.lateness * 1e9):
-            return "late"
-        if self.config.kind == "intensity" and not set(self.config.space) <= set(message.space):
-            return "space"
-        if isinstance(message, LocalIntensity) is not (self.config.kind == "intensity"):
-            return "intensity" if isinstance(message, LocalIntensity) else "tracks"
-        return "" if fits(message) else "length"
 
     def _settle_frame(self, checked: list[_Checked], time: int, journal: Journal) -> None:
         """Let the sources that speak vote on the frame of the picture (see `frames`)."""

@@ -26,6 +26,7 @@ from fusion_service.centre.centre import Centre
 from fusion_service.centre.following import HOLD, Memory, assign, carried, live, next_number, ranked
 from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.motions import USUAL
+from fusion_service.centre.naming import Places
 from fusion_service.centre.publishing import Contributions
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.stated_registration import stated_registration
@@ -63,9 +64,10 @@ class IntensityCentre(Centre):
         return self.config.intensity_rule
 
     def _begin(self) -> None:
-        space = self.config.space
+        config, space = self.config, self.config.space
         self._places = [space.index(axis) for axis in ("x", "y", "z") if axis in space]
-        self._gate, self._keep_gate = (chi2_quantile(p, len(space)) for p in (self.config.gate, self.config.keep_gate))
+        self._gate, self._keep_gate = (chi2_quantile(p, len(space)) for p in (config.gate, config.keep_gate))
+        self._near_gate = chi2_quantile(config.keep_gate, max(len(self._places), 1))
         self._fused = self._nothing(0)
         self._memory = Memory.blank(self._picture.id, 0)
         self._heard: dict[str, tuple[int, int]] = {}
@@ -245,10 +247,14 @@ class IntensityCentre(Centre):
         place, number, lean, nearby = self._states(memory, picture, new)
         picture = replace(picture, existence=np.minimum(picture.existence, nearby))
         birth = self._born(place, number, names)
-        ids = self._ids.allot(len(birth))
+        where = Places(fused.mean[self._places][:, birth], self._spread(birth), self._near_gate)
+        ids = self._ids.allot(len(birth), lambda: where)
         self._journal.birth(ids)
         picture = picture.join(newborn(ids, len(config.space), time))
-        memory, place = memory.of(picture.id, time), np.concatenate([place, birth])
+        place = np.concatenate([place, birth])
+        if (order := picture.order()) is not None:  # a step made again gives ids that are known
+            picture, place = picture.take(order), place[order]
+        memory = memory.of(picture.id, time)
         at = np.flatnonzero(place >= 0)
         state = place[at]
         share, count = np.zeros((len(names), len(picture.id))), np.bincount(state, minlength=len(number))
@@ -263,6 +269,10 @@ class IntensityCentre(Centre):
         memory = replace(memory, held=stands, shared=shared, lean=leans)
         supporting = (share > 0) & (share * (share > 0).sum(axis=0) >= SUPPORT)
         return share[:, ~self._lived(picture, memory, supporting, new, names, time)]
+
+    def _spread(self, at: Ints) -> Floats:
+        """Covariances (p, p, B) of the places of some components."""
+        return self._fused.spread[np.ix_(self._places, self._places)][:, :, at]
 
     def _lived(
         self, picture: Picture, memory: Memory, supporting: Bools, new: Bools, names: tuple[str, ...], time: int

@@ -67,6 +67,11 @@ class Journal:
         """The names that decisions index."""
         self._sources = names
 
+    @property
+    def sources(self) -> tuple[str, ...]:
+        """The names that decisions index."""
+        return self._sources
+
     def event(self, event: dict[str, Any]) -> None:
         """Something other than a message that changes results or explains them."""
         if len(self._events) < MOST_ENTRIES:
@@ -141,6 +146,14 @@ class Journal:
         """A global track is no more."""
         self.tracks(messages.DELETED, np.array([track], dtype=np.uint64))
         self._ended.append((track, reason, replaced_by))
+
+    def taken(self) -> tuple[Entry, ...]:
+        """The messages used in this step so far."""
+        return tuple(self._taken)
+
+    def not_taken(self) -> tuple[Entry, ...]:
+        """What was refused in it."""
+        return tuple(self._refused)
 
     def ended(self) -> tuple[tuple[int, str, int | None], ...]:
         return tuple(self._ended)

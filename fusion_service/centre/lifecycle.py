@@ -92,8 +92,12 @@ class Picture:
         return below[at.astype(np.intp)]
 
     def join(self, other: Picture) -> Picture:
-        """Both; ids of `other` are above all of these."""
+        """Both, one after the other: sorted where the ids of `other` are above all of these (see `order`)."""
         return join_tracks([self, other])
+
+    def order(self) -> NDArray[np.intp] | None:
+        """By which its rows are to be taken to be sorted by id; None where they are."""
+        return None if (self.id[1:] > self.id[:-1]).all() else np.argsort(self.id)
 
 
 def empty_picture(n: int) -> Picture:

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 
 from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats, Ints
-from fusion_service.centre.births import group
+from fusion_service.centre.births import group, locals_of
 from fusion_service.centre.candidates import Candidates, find_candidates
 from fusion_service.centre.copies import Copies
 from fusion_service.centre.evidence import LOW, PairEvidence, RivalLinks, Tests
@@ -247,7 +247,7 @@ class Linker:
         if len(chosen) > room:
             journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(chosen) - room))
             chosen = chosen[:room]
-        new = self._ids.allot(len(chosen))
+        new = self._ids.allot(len(chosen), lambda: locals_of(rows, journal.sources, free, groups, chosen))
         given = np.zeros(count, dtype=np.uint64)
         given[chosen] = new
         takes = given[groups] != NO_TRACK
@@ -259,7 +259,7 @@ class Linker:
             link = int(tracks.link[row])
             if link in born:
                 journal.split(link, old)
-                self.merges.part(old, link, self.tests.bound)
+                self.merges.part(min(old, link), max(old, link), self.tests.bound)
         return picture.join(newborn(new, len(self.config.space), time))
 
     def _merge(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> dict[int, int]:

@@ -163,7 +163,7 @@ class _Hands:
         mean, covariance = brought(
             source.tracks.mean[:, one], source.tracks.covariance[..., one], source.space, Unknown.of(space)
         )
-        new = self._ids.allot(1)
+        new = self._ids.allot(1, lambda: [[(local.source, local.epoch, local.id)]])
         born = replace(
             newborn(new, len(space), self.time),
             mean=mean,
@@ -173,6 +173,8 @@ class _Hands:
             seen=source.tracks.time[at : at + 1],
         )
         self.picture = self.picture.join(born)
+        if (order_by := self.picture.order()) is not None:  # a step made again gives ids that are known
+            self.picture = self.picture.take(order_by)
         self._release_forced(local)
         self._set_link(local, int(new[0]))
         self.journal.birth(new)

@@ -63,9 +63,10 @@ def picture_message(
     step: int,
     time: int,
     rule: str,
+    revised: int | None = None,
 ) -> GlobalTracks:
     """The message that publishes a picture; its lineage is every source known, what is in the tracks, and the centre
-    itself."""
+    itself. revised: as in `GlobalTracks`."""
     config, names = intake.config, intake.names()
     picture, contributions = _published(picture, contributions, intake)
     origins = {source.origin for source in intake.sources.values() if source.messages}
@@ -98,6 +99,7 @@ def picture_message(
         **_ways(picture, rule),
         **extent_columns(picture),
         **labels.columns(picture.id, origin),
+        revised=revised,
     )
 
 

@@ -149,6 +149,4 @@ def _as_said(tracks: _Densities, inflation: float) -> _Densities:
     """Covariances before they were inflated."""
     if inflation == 1.0:
         return tracks
-    return replace(
-        tracks, covariance=tracks.covariance / inflation, part_covariance=tracks.part_covariance / inflation
-    )
+    return replace(tracks, covariance=tracks.covariance / inflation, part_covariance=tracks.part_covariance / inflation)

@@ -129,6 +129,11 @@ class CentreConfig:
     period: float = _setting(1.0, number(0.01, 1e5), "seconds between steps; trigger = arrival: between full pictures")
     delay: float = _setting(0.5, DURATION, "wall clock: how far behind now a step is")
     lateness: float = _setting(5.0, DURATION, "how late a message may be, seconds")
+    revise: float = _setting(
+        4.0,
+        number(0, 1e6),
+        "steps made again for late data, at most, for each step; 0: they are taken as they come",
+    )
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
     rule: str = _setting("auto", read_rule, "fusion rule (fusion-service rules lists them)")
     rule_options: dict[str, Any] = _setting({}, rule_options, "options of the rule, e.g. {criterion = 'trace'}")

@@ -44,8 +44,8 @@ class _Watch:
             message = decode(data)
         except MessageError:
             return
-        if isinstance(message, GlobalTracks) and (message := self._wholes.of(message)) is not None:
-            self.shown, self.changed = int((message.status > 0).sum()), time.monotonic()
+        if isinstance(message, GlobalTracks) and (whole := self._wholes.of(message)) is not None:
+            self.shown, self.changed = int((whole.status > 0).sum()), time.monotonic()
 
 
 def run_demo(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -44,7 +46,7 @@ def test_what_is_kept_is_within_its_certificate(N: int, criterion: str) -> None:
     np.testing.assert_allclose(fused.influence[:, kept], given.influence, atol=1e-12)
 
 
-VALUES = {
+VALUES: dict[str, Callable[[Floats], Floats]] = {
     "det": lambda P: np.linalg.det(np.moveaxis(P, -1, 0)),
     "trace": lambda P: np.trace(P),
 }

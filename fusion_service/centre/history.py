@@ -1,0 +1,241 @@
+"""What a centre keeps of its newest steps, so that they can be made again when late data belong to them.
+
+Of every step of the last `lateness` it keeps what went into it: orders, sources that came and went, the messages
+taken. Of some it keeps the state before them, as a checkpoint: one in about an eighth of `lateness`, fewer where the
+tables are large, and of the newest `RECENT` while data come late. A message is late where a step that was made should
+have taken it, by its time. Before the next step the centre then goes back to the newest kept state before that one, and
+makes the steps from there again with all of their inputs, each where it belongs by its time.
+
+Once in a step at most, and no more than `revise` steps for each step on the average: what there is no room for now is
+taken as it comes, and put in its place when steps are made again the next time. So the cost of late data is bounded,
+and by nothing but the inputs: a replay makes the same steps again.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+
+from fusion_service.centre.events import Event, SourceFound, SourceLost
+from fusion_service.centre.intake import MAX_ORDERS, MAX_SOURCES, Intake
+from fusion_service.centre.pictures import source_of
+from fusion_service.centre.refusing import would_refuse
+from fusion_service.centre.scans import size_of
+from fusion_service.config import CentreConfig
+from fusion_service.order import Order
+from schemas import Entry, GlobalTracks, LocalIntensity, LocalTracks, Message, MessageError, Status, digest
+
+__all__ = ["History", "Key", "Late", "Past", "key_of"]
+
+STATES = 8
+"""Kept states in one `lateness`, about."""
+MOST_ROWS = 1_000_000
+"""Tracks, local and global, in all kept states together; above that there are fewer states, but two at least."""
+RECENT = 3
+"""Newest states that are kept while data come late."""
+BUSY = 20
+"""Steps for which they are kept after the last late message."""
+MOST_STEPS = 2000
+MOST_COMPONENTS = 1_000_000
+"""Of the inputs that are kept."""
+MOST_OWED = 50_000
+
+Key = tuple[str, int, int, int]
+"""Source, epoch, number and digest of a message."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Late:
+    """A queued message that an earlier step should have taken, the first at or after `due`, ns."""
+
+    key: Key
+    due: int
+    event: Message
+    received: int
+
+
+@dataclass(slots=True, eq=False)
+class Past:
+    """A step that was made: its time and that of the one before it, ns; events and messages that went into it, with
+    when they came; state: the checkpoint before it, lasting: as one of the few that are kept for long."""
+
+    number: int
+    time: int
+    before: int
+    events: tuple[tuple[Event, int], ...]
+    inputs: list[tuple[Message, int]] = field(default_factory=list)
+    state: bytes | None = None
+    lasting: bool = False
+    size: int = 0
+
+
+def key_of(entry: Entry) -> Key:
+    """The key of the message that a log's entry names."""
+    return entry.source, entry.epoch, entry.seq, entry.hash
+
+
+class History:
+    """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source;
+    revised: steps made again since the start."""
+
+    def __init__(self, config: CentreConfig) -> None:
+        self._lateness = round(config.lateness * 1e9)
+        self._pace = config.revise
+        self.on = self._pace > 0 and self._lateness > 0
+        self.past: list[Past] = []
+        self.late: Counter[str] = Counter()
+        self.revised = 0
+        self._credit = 0.0
+        self._busy = 0
+        self._size = 0
+        self._owed: dict[Key, int] = {}
+        self._presence: dict[str, tuple[Event, int]] = {}
+        self._orders: list[tuple[Event, int]] = []
+
+    @property
+    def oldest(self) -> int:
+        """The number of the oldest step that may be made again."""
+        return self.past[0].number if self.past else 2**63
+
+    def note(self, event: Event, received: int) -> None:
+        """An event was queued for the next step."""
+        if not self.on:
+            return
+        if isinstance(event, (SourceFound, SourceLost)):
+            if event.source in self._presence or len(self._presence) < 2 * MAX_SOURCES:
+                self._presence[event.source] = event, received
+        elif isinstance(event, Order) and len(self._orders) < MAX_ORDERS:
+            self._orders.append((event, received))
+
+    def noted(self) -> tuple[tuple[Event, int], ...]:
+        """The events for the step that is made now."""
+        events = (*self._presence.values(), *self._orders)
+        self._presence, self._orders = {}, []
+        return events
+
+    def clear(self) -> None:
+        """Nothing that was made so far is made again."""
+        self.past, self._owed, self._size, self._credit = [], {}, 0, 0.0
+
+    def find(self, intake: Intake, last: int) -> list[Late]:
+        """The queued messages that a step until `last`, ns, should have taken, and that would be taken now."""
+        found: dict[Key, Late] = {}
+        for event, received in intake.queue:
+            if not isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks)):
+                continue
+            due = event.time - intake.treatment(source_of(event)).clock
+            if due > last or event.time < last - self._lateness:
+                continue
+            try:
+                code = digest(event)
+            except MessageError:
+                continue
+            key = source_of(event), event.epoch, event.seq, code
+            if key not in found and not would_refuse(intake, event, code, received, last):
+                found[key] = Late(key, due, event, received)
+        return list(found.values())
+
+    def start(self, late: Sequence[Late]) -> int | None:
+        """The step in `past` from which steps are to be made again for these and what is owed, None where nothing is.
+        Call it once a step."""
+        self._credit = min(self._credit + self._pace, max(float(len(self.past)), self._pace))
+        first = next((i for i, one in enumerate(self.past) if one.state is not None), None)
+        if first is None:
+            self._owed = {}
+            return None
+        floor = self.past[first].before
+        self._owed = {key: due for key, due in self._owed.items() if due > floor}
+        dues = [one.due for one in late if one.due > floor] + list(self._owed.values())
+        if late:
+            self._busy = self.past[-1].number + BUSY
+        if not dues:
+            return None
+        at = bisect_left(self.past, min(dues), key=lambda one: one.time)
+        start = max(i for i in range(first, at + 1) if self.past[i].state is not None)
+        if len(self.past) - start > self._credit:
+            return None
+        self._credit -= len(self.past) - start
+        return start
+
+    def reached(self, late: Iterable[Late], start: int) -> list[Late]:
+        """Those of them that belong to the steps from `start` on."""
+        return [one for one in late if one.due > self.past[start].before]
+
+    def rewind(self, start: int) -> tuple[list[Past], list[Key]]:
+        """Take the steps from `start` on away, to be made again; and what was owed to them."""
+        again, owed = self.past[start:], list(self._owed)
+        del self.past[start:]
+        self._size -= sum(one.size for one in again)
+        self._owed = {}
+        return again, owed
+
+    def told(self, steps: int, moved: Iterable[Key]) -> None:
+        """So many steps were made again, and these messages are now in their places."""
+        self.revised += steps
+        for name, *_ in moved:
+            if name in self.late or len(self.late) < 2 * MAX_SOURCES:
+                self.late[name] += 1
+
+    def futile(self, steps: int) -> None:
+        """It changed nothing to make them again."""
+        self._credit += steps
+
+    def keeps(self, last: int, number: int, rows: int, left: int) -> bool | None:
+        """Whether the state after the step `number`, at `last`, ns, of so many rows is kept for the next one: True, for
+        long; False, while it is one of the newest; None, not. left: steps that are still to be made again."""
+        kept = next((one for one in reversed(self.past) if one.lasting), None)
+        spacing = self._lateness // max(2, min(STATES, MOST_ROWS // max(rows, 1)))
+        if kept is None or last - kept.before >= spacing:
+            return True
+        return False if number < self._busy and left < RECENT else None
+
+    def told_in(self, status: Status) -> Status:
+        """A status with what was put in its place, and how many steps were made again, since the start."""
+        if not self.late:
+            return status
+        queue = dict(status.queue) | {"late": self.late.total(), "revised": self.revised}
+        sources = {name: entry | {"late": self.late[name]} for name, entry in status.sources.items()}
+        return replace(status, queue=queue, sources=sources)
+
+    def add(self, one: Past, raw: dict[Key, tuple[Message, int, int]], taken: Iterable[Entry], owes: bool) -> None:
+        """A step was made that took `taken` of `raw`. owes: it is no step made again, so that what it took late is
+        owed to earlier ones."""
+        if not self.on:
+            return
+        for entry in taken:
+            key = key_of(entry)
+            if key in raw:
+                event, received, due = raw[key]
+                one.inputs.append((event, received))
+                one.size += size_of(event)
+                if owes and isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks)):
+                    self._owe(key, due, one.before)
+        self.past.append(one)
+        self._size += one.size
+        for old in self.past[:-RECENT][-BUSY:]:
+            if not old.lasting:
+                old.state = None
+        self._trim(one.time - self._lateness)
+
+    def _owe(self, key: Key, due: int, before: int) -> None:
+        if before >= 0 and due <= before and len(self._owed) < MOST_OWED:
+            self._owed[key] = due
+
+    def _trim(self, oldest: int) -> None:
+        """Let go what no late message reaches any more, or there is no room for."""
+        starts = [i for i, one in enumerate(self.past) if one.state is not None]
+        if not starts:
+            self.past, self._size = [], 0
+            return
+        cut = max((i for i in starts if self.past[i].before <= oldest), default=starts[0])
+        size = self._size - sum(one.size for one in self.past[:cut])
+        while len(self.past) - cut > MOST_STEPS or size > MOST_COMPONENTS:
+            after = next((i for i in starts if i > cut), len(self.past))
+            size -= sum(one.size for one in self.past[cut:after])
+            cut = after
+            if cut == len(self.past):
+                break
+        del self.past[:cut]
+        self._size = size

@@ -1,0 +1,146 @@
+"""Which id a track takes that begins in a step made again: the one it has been published under, if it has.
+
+A global id stays with its target, and is never given to another. Where steps are made again (`history`), the tracks
+that begin in them are known already under ids that were given in the first course of these steps, to groups of the same
+local tracks. A group takes the id that one of its local tracks is linked to at the end of the first course; else
+that of a track that one of them founded; else a new one. Only ids of tracks that are not there in the state from which
+the steps are made again may be taken, each once.
+
+The components of an intensity have no ids: their tracks take the id of the nearest birth of the first course within
+the gate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion_service import linalg
+from fusion_service.arrays import Floats
+
+__all__ = ["Birth", "Book", "LocalKey", "Places", "Table"]
+
+MOST_BIRTHS = 200_000
+"""Births that are remembered; the oldest are forgotten."""
+LocalKey = tuple[str, int, int]
+"""Source, epoch and id of a local track."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Table:
+    """The links of one source: its epoch, local ids (T,) u64, global ids (T,) u64."""
+
+    epoch: int
+    id: NDArray[np.uint64]
+    link: NDArray[np.uint64]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Places:
+    """Where B tracks begin: mean (p, B), covariance (p, p, B), the d2 within which two may be the same."""
+
+    mean: Floats
+    covariance: Floats
+    gate: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Birth:
+    """A global id as it was given: in which step, to which local track, or where (mean, covariance)."""
+
+    step: int
+    id: int
+    founder: LocalKey | None
+    place: tuple[Floats, Floats] | None = None
+
+
+@dataclass(slots=True)
+class Book:
+    """The births of the steps that may be made again. step: the one that is being made.
+
+    born: those of the present course, in order; spare: of ids that an earlier course has given, and this has not.
+    """
+
+    step: int = 0
+    born: list[Birth] = field(default_factory=list)
+    spare: list[Birth] = field(default_factory=list)
+    _free: dict[int, Birth] = field(default_factory=dict)
+    _links: dict[LocalKey, int] = field(default_factory=dict)
+    _founded: dict[LocalKey, list[int]] = field(default_factory=dict)
+
+    def clear(self) -> None:
+        """Nothing will be made again of what was made so far."""
+        self.born, self.spare = [], []
+
+    def forget(self, before: int) -> None:
+        """No step before `before` will be made again."""
+        if (self.born and self.born[0].step < before) or self.spare or len(self.born) > MOST_BIRTHS:
+            self.born = [one for one in self.born if one.step >= before][-MOST_BIRTHS:]
+            self.spare = [one for one in self.spare if one.step >= before][-MOST_BIRTHS:]
+
+    def again(self, step: int, tables: Mapping[str, Table]) -> None:
+        """The steps after `step` are made again. tables: the links until now, by source."""
+        free = [one for one in self.born if one.step > step] + self.spare
+        self.born = [one for one in self.born if one.step <= step]
+        self._free, self._links, self._founded = {one.id: one for one in free}, {}, {}
+        ids = np.array(sorted(self._free), dtype=np.uint64)
+        for name, table in sorted(tables.items()):
+            mine = np.isin(table.link, ids)
+            for local, track in zip(table.id[mine].tolist(), table.link[mine].tolist(), strict=True):
+                self._links[name, max(table.epoch, 0), local] = track
+        for one in free:
+            if one.founder is not None:
+                self._founded.setdefault(one.founder, []).append(one.id)
+
+    def done(self) -> None:
+        """They are made."""
+        self.spare = list(self._free.values())
+        self._free, self._links, self._founded = {}, {}, {}
+
+    def allot(self, whom: Sequence[Sequence[LocalKey]] | Places, fresh: Callable[[int], list[int]]) -> list[int]:
+        """An id for each group of local tracks that begins a track, or each place; fresh: gives new ones."""
+        count = whom.mean.shape[1] if isinstance(whom, Places) else len(whom)
+        known: list[int | None] = [None] * count
+        if self._free:
+            known = self._nearest(whom) if isinstance(whom, Places) else self._linked(whom)
+        new = iter(fresh(known.count(None)))
+        ids = [next(new) if one is None else one for one in known]
+        for place, one in enumerate(ids):
+            founder = None if isinstance(whom, Places) or not whom[place] else whom[place][0]
+            where = (whom.mean[:, place], whom.covariance[:, :, place]) if isinstance(whom, Places) else None
+            self.born.append(Birth(self.step, one, founder, where))
+        return ids
+
+    def _take(self, ids: Iterable[int | None]) -> int | None:
+        found = next((one for one in ids if one is not None and one in self._free), None)
+        if found is not None:
+            del self._free[found]
+        return found
+
+    def _linked(self, whom: Sequence[Sequence[LocalKey]]) -> list[int | None]:
+        known = [self._take(self._links.get(local) for local in group) for group in whom]
+        for place, group in enumerate(whom):
+            if known[place] is None:
+                known[place] = self._take(one for local in group for one in self._founded.get(local, ()))
+        return known
+
+    def _nearest(self, where: Places) -> list[int | None]:
+        known: list[int | None] = [None] * where.mean.shape[1]
+        free = [one for one in self._free.values() if one.place is not None]
+        if not free or not known:
+            return known
+        means = np.stack([one.place[0] for one in free if one.place is not None], axis=-1)
+        spreads = np.stack([one.place[1] for one in free if one.place is not None], axis=-1)
+        pairs = []
+        for place in range(len(known)):
+            away = means - where.mean[:, place, None]
+            distance = linalg.quadratic(spreads + where.covariance[:, :, place, None], away)
+            near = np.flatnonzero(distance <= where.gate)
+            pairs += [(float(distance[i]), place, i) for i in near.tolist()]
+        for _, place, i in sorted(pairs):
+            if known[place] is None:
+                known[place] = self._take([free[i].id])
+        return known
