@@ -47,8 +47,8 @@ def test_what_is_kept_is_within_its_certificate(N: int, criterion: str) -> None:
 
 
 VALUES: dict[str, Callable[[Floats], Floats]] = {
-    "det": lambda P: np.linalg.det(np.moveaxis(P, -1, 0)),
-    "trace": lambda P: np.trace(P),
+    "det": lambda P: np.asarray(np.linalg.det(np.moveaxis(P, -1, 0))),
+    "trace": lambda P: np.asarray(np.trace(P)),
 }
 
 
