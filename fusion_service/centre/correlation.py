@@ -86,11 +86,11 @@ class Correlation:
 
     def _start(self, rows: Rows, members: Ints) -> Floats | None:
         """The weights (N, B) of the last step."""
-        return None if self.kept is None else self.kept.of(rows.tracks.link[members[:, 0]], members.shape[1])
+        return None if self.kept is None else self.kept.of(rows.tracks.link[members[:, 0]], rows.source[members.T])
 
     def _note(self, rows: Rows, members: Ints, weights: Floats) -> None:
         if self.kept is not None:
-            self.kept.note(rows.tracks.link[members[:, 0]], weights)
+            self.kept.note(rows.tracks.link[members[:, 0]], rows.source[members.T], weights)
 
     def _sure(
         self,
