@@ -77,8 +77,8 @@ def key_of(entry: Entry) -> Key:
 
 
 class History:
-    """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source;
-    revised: steps made again since the start."""
+    """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source,
+    and reordered, those of them that came after a later one; revised: steps made again since the start."""
 
     def __init__(self, config: CentreConfig) -> None:
         self._lateness = round(config.lateness * 1e9)
@@ -86,6 +86,7 @@ class History:
         self.on = self._pace > 0 and self._lateness > 0
         self.past: list[Past] = []
         self.late: Counter[str] = Counter()
+        self.reordered: Counter[str] = Counter()
         self.revised = 0
         self._credit = 0.0
         self._busy = 0
@@ -196,7 +197,10 @@ class History:
         if not self.late:
             return status
         queue = dict(status.queue) | {"late": self.late.total(), "revised": self.revised}
-        sources = {name: entry | {"late": self.late[name]} for name, entry in status.sources.items()}
+        sources = {
+            name: entry | {"late": self.late[name], "reordered": entry["reordered"] + self.reordered[name]}
+            for name, entry in status.sources.items()
+        }
         return replace(status, queue=queue, sources=sources)
 
     def add(self, one: Past, raw: dict[Key, tuple[Message, int, int]], taken: Iterable[Entry], owes: bool) -> None:

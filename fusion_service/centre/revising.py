@@ -107,6 +107,7 @@ class Revision:
         is otherwise, ns; None where nothing has come of it."""
         for entry in self._taken:
             journal.accept(entry)
+            self._history.reordered[entry.source] += self._overtaken(entry)
         for entry in self._refused:
             journal.refuse(entry)
         if not self._moved:
@@ -125,6 +126,13 @@ class Revision:
         for track in gone.tolist():
             journal.end(track, "revised", self._heir(track, intake, ids))
         return since
+
+    def _overtaken(self, entry: Entry) -> bool:
+        """Whether a late message came after one of its source with a higher number."""
+        source = self._before.sources.get(entry.source)
+        return (
+            source is not None and source.epoch == entry.epoch and entry.seq < max(source.highest.values(), default=0)
+        )
 
     def _heir(self, track: int, intake: Intake, ids: _Ids) -> int | None:
         """The track of `ids` that goes on for one that is no more."""

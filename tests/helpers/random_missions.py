@@ -359,7 +359,7 @@ def restarted(mission: Mission, after: int) -> list[StepResult]:
     results = []
     for number, given in enumerate(mission.given):
         if number == after:
-            queued = list(centre._intake._queue)
+            queued = list(centre._intake.queue)
             centre = FusionCentre(mission.config, centre.checkpoint(), epoch=START)
             for message, received in queued:
                 centre.handle(message, received)
