@@ -157,8 +157,9 @@ class Centre(ABC):
         journal = self._journal
         self._obey(self._intake.take_orders(), time)
         self._forget_lineages()
+        told = len(journal.taken())  # of what was late
         self._intake.admit(time, self._time, journal)
-        self._history.add(past, self._intake.raw, journal.taken(), owes=events is None)
+        self._history.add(past, self._intake.raw, journal.taken()[told:], owes=events is None)
         self._time = time
         if self._intake.reframed:
             self._intake.reframed = False
