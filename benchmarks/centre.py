@@ -1,28 +1,39 @@
 """A step of the centre beside its parts, side by side in one run: `python -m benchmarks.centre`.
 
-T targets seen by three sources each, links standing, det-CI. The ratio is to the time of the bare fusion of the
-same T x 3 tracks by `fuse_last`; "first" is the step that links everything from nothing. Then the same under every
-memory and under `auto`, of trackers that are Kalman filters: the part of a step that fuses, and its ratio to that of
-`ci`; goal: `memory = "tracklet"` within 2 at 10,000 targets.
+    python -m benchmarks.centre --scene 4x5000x2 --set rule=ci --set supervision=off
+
+Sources with unequal covariances (`benchmarks.load`), links standing: CPU of reading the messages, of a step and its
+parts, of a checkpoint and of packing what is published; beside the floor: unpack the same bytes, fuse as many tracks in
+one batch by `naive`, pack. Then mixtures beside Gaussians; and every memory and `auto`, of trackers that are Kalman
+filters: the part of a step that fuses, and its ratio to that of `ci`; goal: `memory = "tracklet"` within 2 at 10,000
+targets.
 """
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
+import os
 import time
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
 
 import schemas
+from benchmarks.load import FRAME, SPACE, Load
+from benchmarks.service import setting
 from fusion_service.centre import FusionCentre
+from fusion_service.centre import centre as centre_module
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.linking import Linker
 from fusion_service.centre.memory import Memory
+from fusion_service.centre.motions import Motions
+from fusion_service.centre.supervision import Supervisor
 from fusion_service.rules import fuse_last
 
 SECOND = 10**9
-SPACE = ("x", "y", "vx", "vy")
-FRAME = schemas.Enu(59.0, -55.0)
 SIGMA = np.array([30.0, 30.0, 2.0, 2.0])
 WAYS: dict[str, dict[str, Any]] = {
     "ci": {"rule": "ci"},
@@ -34,52 +45,100 @@ WAYS: dict[str, dict[str, Any]] = {
 }
 
 
-def messages(states: np.ndarray, second: int, rng: np.random.Generator) -> list[schemas.LocalTracks]:
-    now = states.copy()
-    now[:, :2] += second * states[:, 2:]
-    return [
-        schemas.LocalTracks(
-            source=source, epoch=1, seq=second, sent=0, time=second * SECOND, complete=True, space=SPACE, frame=FRAME,
-            ids=np.arange(1, len(states) + 1, dtype=np.uint64),
-            means=now + rng.normal(size=now.shape) * SIGMA,
-            covariances=np.tile(np.diag(SIGMA**2), (len(states), 1, 1)),
-        )
-        for source in ("r1", "r2", "r3")
-    ]  # fmt: skip
-
-
 def best(call: Callable[[], object], repeat: int = 5) -> float:
     times = []
     for _ in range(repeat):
-        begin = time.perf_counter()
+        begin = time.process_time()
         call()
-        times.append(time.perf_counter() - begin)
+        times.append(time.process_time() - begin)
     return min(times)
 
 
-def run(targets: int) -> str:
-    rng = np.random.default_rng(1)
-    side = 2000.0 * np.sqrt(targets)
-    states = np.concatenate([rng.uniform(-side, side, (targets, 2)), rng.normal(0, 50, (targets, 2))], axis=1)
-    centre = FusionCentre({"sources": {name: {"override": True} for name in ("r1", "r2", "r3")}})
-    steps = []
-    for second in range(1, 8):
-        batch = messages(states, second, rng)
-        for message in batch:
-            centre.handle(message, 10**18)
-        begin = time.perf_counter()
-        centre.step(second * SECOND)
-        steps.append(time.perf_counter() - begin)
-    means = np.ascontiguousarray(np.stack([m.means.T for m in batch]))
-    covariances = np.ascontiguousarray(np.stack([np.moveaxis(m.covariances, 0, 2) for m in batch]))
-    fusing = best(lambda: fuse_last("ci", means, covariances, criterion="det", influence=True))
-    data = [schemas.encode(message) for message in batch]
-    reading = best(lambda: schemas.check_numbers([schemas.decode(one) for one in data]))  # type: ignore[misc]
-    saving = best(centre.checkpoint)
-    step = min(steps[1:])
+PARTS: dict[str, tuple[Any, str]] = {
+    "take in": (Intake, "admit"),
+    "predict local": (centre_module, "usable_rows"),
+    "predict global": (Motions, "predicted"),
+    "associate": (Linker, "link"),
+    "supervise": (Supervisor, "observe"),
+    "fuse": (Memory, "fuse"),
+    "publish": (centre_module, "picture_message"),
+}
+"""What of a step is timed apart: of which class or module, and its name there."""
+
+
+@contextmanager
+def parts(times: dict[str, float]) -> Iterator[None]:
+    """Within it, the CPU seconds of each of `PARTS` are added up."""
+
+    def timed(name: str, call: Callable[..., Any]) -> Callable[..., Any]:
+        def done(*args: Any, **more: Any) -> Any:
+            begin = time.process_time()
+            try:
+                return call(*args, **more)
+            finally:
+                times[name] = times.get(name, 0.0) + time.process_time() - begin
+
+        return done
+
+    before = {name: getattr(owner, attribute) for name, (owner, attribute) in PARTS.items()}
+    for name, (owner, attribute) in PARTS.items():
+        setattr(owner, attribute, timed(name, before[name]))
+    try:
+        yield
+    finally:
+        for name, (owner, attribute) in PARTS.items():
+            setattr(owner, attribute, before[name])
+
+
+def floor(data: list[bytes], overlap: int) -> float:
+    """CPU seconds to unpack a scan of every source, fuse as many tracks in one batch by `naive`, and pack a scan."""
+
+    def once() -> None:
+        messages = [one for one in map(schemas.decode, data) if isinstance(one, schemas.LocalTracks)]
+        few = min(len(one.ids) for one in messages)
+        means = np.ascontiguousarray(np.stack([one.means[:few].T for one in messages[:overlap]]))
+        spreads = [np.moveaxis(one.covariances[:few], 0, -1) for one in messages[:overlap]]
+        for _ in range(max(len(data) // overlap, 1)):
+            fuse_last("naive", means, np.ascontiguousarray(np.stack(spreads)))
+        schemas.encode(messages[0])
+
+    return best(once)
+
+
+def run(load: Load, settings: dict[str, Any], count: int = 14, warm: int = 5) -> str:
+    """A line: the median step after `warm`, its parts, reading, saving and packing, and the ratio to the floor."""
+    world, period = load.world(), 1.0 / load.rate
+    sources = {f"load-{s + 1:02d}": {"override": True, "period": period} for s in range(load.sources)}
+    frame = {"kind": "enu", "lat": FRAME.lat, "lon": FRAME.lon}
+    centre = FusionCentre({"period": period, "frame": frame, "sources": sources, **settings})
+    steps, split = [], dict.fromkeys(PARTS, 0.0)
+    for scan in range(count):
+        data = [schemas.encode(world.message(s, scan, SECOND)) for s in range(load.sources)]
+        told: dict[str, float] = {}
+        marks = [time.process_time()]
+        for one in data:
+            centre.handle(schemas.decode(one), 10**18)
+        marks.append(time.process_time())
+        with parts(told):
+            result = centre.step(SECOND + round(scan * period * 1e9))
+        marks.append(time.process_time())
+        centre.checkpoint()
+        marks.append(time.process_time())
+        schemas.encode(result.tracks), schemas.encode(result.log)
+        marks.append(time.process_time())
+        if scan >= warm:
+            steps.append(np.diff(marks))
+            for name in PARTS:
+                split[name] += told.get(name, 0.0) / (count - warm)
+    read, step, save, pack = 1e3 * np.median(steps, axis=0)
+    whole = sum((read, step, save, pack))
+    found = len(result.tracks.ids)
+    fine = "" if found == load.targets else f"  ({found} tracks of {load.targets} targets)"
+    least, each = 1e3 * floor(data, load.overlap), 1e3 * whole / (load.sources * load.tracks)
     return (
-        f"{targets:7d} {1e3 * steps[0]:10.2f} {1e3 * step:10.2f} {step / fusing:12.1f} "
-        f"{1e3 * reading:12.2f} {1e3 * saving:12.2f} {1e6 * step / targets:14.1f}"
+        f"{load.sources:3d} x {load.tracks:6,d} by {load.overlap:2d} {read:7.1f} {step:8.1f} "
+        + " ".join(f"{1e3 * split[name]:7.1f}" for name in PARTS)
+        + f" {save:7.1f} {pack:6.1f} {whole:8.1f} {whole / least:7.1f} {each:7.2f}{fine}"
     )
 
 
@@ -103,20 +162,19 @@ def mixtures(batch: list[schemas.LocalTracks], components: int, rng: np.random.G
     return out
 
 
-def run_mixtures(rule: str, components: int, targets: int = 1000) -> float:
-    """Seconds of a step with so many components per track, links standing."""
-    rng = np.random.default_rng(1)
-    side = 2000.0 * np.sqrt(targets)
-    states = np.concatenate([rng.uniform(-side, side, (targets, 2)), rng.normal(0, 50, (targets, 2))], axis=1)
-    sources = {name: {"override": True} for name in ("r1", "r2", "r3")}
+def run_mixtures(rule: str, components: int) -> float:
+    """CPU seconds of a step of 1,000 targets of 3 sources, so many components a track, links standing."""
+    rng, load = np.random.default_rng(1), Load(3, 1000, 3, rate=1.0)
+    world = load.world()
+    sources = {f"load-{s + 1:02d}": {"override": True} for s in range(3)}
     centre = FusionCentre({"sources": sources, "mixture_rule": rule, "max_components": 4})
     steps = []
-    for second in range(1, 5):
-        for message in mixtures(messages(states, second, rng), components, rng):
+    for scan in range(6):
+        for message in mixtures([world.message(s, scan, SECOND) for s in range(3)], components, rng):
             centre.handle(message, 10**18)
-        begin = time.perf_counter()
-        centre.step(second * SECOND)
-        steps.append(time.perf_counter() - begin)
+        begin = time.process_time()
+        centre.step(SECOND + scan * SECOND)
+        steps.append(time.process_time() - begin)
     return min(steps[1:])
 
 
@@ -180,10 +238,23 @@ def run_memory(targets: int, settings: dict[str, Any], rounds: int = 8) -> tuple
     return min(centre._memory.times[3:]), min(steps[3:])
 
 
+SCENES = (Load(3, 20, 3), Load(3, 1000, 3), Load(4, 5000, 2), Load(3, 10_000, 3), Load(20, 1000, 20))
+
+
 def main() -> None:
-    print("targets   first ms    step ms  step/fusion   reading ms    saving ms  us per target")
-    for targets in (20, 200, 1000, 5000):
-        print(run(targets), flush=True)
+    """Read the options, and print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--set", type=setting, action="append", default=[], help="KEY=VALUE under [centre]")
+    parser.add_argument("--scene", action="append", default=[], help="SOURCESxTRACKSxOVERLAP, and no other table")
+    given = parser.parse_args()
+    scenes = [Load(*map(int, one.split("x"))) for one in given.scene] or SCENES
+    print(f"CPU ms a step; {dict(given.set) or 'defaults'}; load of the machine {os.getloadavg()[0]:.2f}")
+    heads = " ".join(f"{name.split()[-1][:7]:>7}" for name in PARTS)
+    print(f"{'scene':<19} {'read':>4} {'step':>8} {heads} {'save':>7} {'pack':>6} {'all':>8} x floor us each")
+    for load in scenes:
+        print(run(load, dict(given.set)), flush=True)
+    if given.scene:
+        return
     one = run_mixtures("moments", 1)
     print(f"\n1000 targets of 3 sources, Gaussian: {1e3 * one:.1f} ms; with 4 components each, capped at 4:")
     for rule in ("moments", "aa", "gm-ga"):

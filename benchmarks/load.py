@@ -85,10 +85,13 @@ class World:
 
     def message(self, source: int, scan: int, start: int = 0) -> schemas.LocalTracks:
         """What a source says in its scan of that number; `start`: the time of the scan 0, ns."""
-        after = round(scan / self.load.rate * 1e9)
+        return self.at(source, scan, start + round(scan / self.load.rate * 1e9), start)
+
+    def at(self, source: int, scan: int, time: int, start: int) -> schemas.LocalTracks:
+        """The same of a scan at any `time`, ns; `start`: when the truth begins."""
         return schemas.LocalTracks(
-            source=f"load-{source + 1:02d}", epoch=1, seq=scan, sent=start + after, time=start + after, complete=True,
+            source=f"load-{source + 1:02d}", epoch=max(start, 1), seq=scan, sent=time, time=time, complete=True,
             space=SPACE, frame=FRAME, ids=(self._whose[source] + 1).astype(np.uint64),
-            means=self.truth(after)[self._whose[source]] + self._errors[scan % KEPT][source],
+            means=self.truth(time - start)[self._whose[source]] + self._errors[scan % KEPT][source],
             covariances=self._covariances[source],
         )  # fmt: skip

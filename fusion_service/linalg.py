@@ -19,13 +19,15 @@ the condition of the correlation matrix, not of P.
 """
 
 from collections.abc import Iterator
-from math import prod
 
 import numpy as np
 
 from fusion_service.arrays import Bools, Floats
+from fusion_service.compiled import either
+from fusion_service.layout import TURN, blocks, to_first, to_last
 
 __all__ = [
+    "TURN",
     "blocks",
     "condition",
     "congruence",
@@ -50,47 +52,8 @@ __all__ = [
     "trace_inverse_det",
 ]
 
-CACHE_BYTES = 1 << 19
-"""What one block's (n, n, B) array may occupy: half a megabyte, some 4,000 matrices at n = 4."""
 
-TURN = 128
-"""Elements transposed at a time: five times faster than a long array at once."""
-
-
-def to_last(a: Floats, core: int) -> Floats:
-    """Flatten the leading batch axes of `a` and move them last: (..., *core axes) -> (*core axes, B).
-
-    `core` is the number of trailing axes that make one element (1: vectors, 2: matrices). Contiguous copy.
-    """
-    a = np.asarray(a, dtype=np.float64)
-    batch, shape = a.shape[: a.ndim - core], a.shape[a.ndim - core :]
-    size, entries = prod(batch), prod(shape)
-    out = np.empty((*shape, size))
-    tall, wide = a.reshape(size, entries), out.reshape(entries, size)
-    for i in range(0, size, TURN):
-        wide[:, i : i + TURN] = tall[i : i + TURN].T
-    return out
-
-
-def to_first(a: Floats, batch: tuple[int, ...], core: int, out: Floats | None = None) -> Floats:
-    """The inverse of `to_last`: (*core axes, B) -> (*batch, *core axes), a contiguous copy, or into `out`."""
-    shape = a.shape[:core]
-    size, entries = prod(batch), prod(shape)
-    if out is None:
-        out = np.empty((*batch, *shape))
-    tall, wide = out.reshape(size, entries), a.reshape(entries, size)
-    for i in range(0, size, TURN):
-        tall[i : i + TURN] = wide[:, i : i + TURN].T
-    return out
-
-
-def blocks(n: int, size: int, copies: int = 1) -> Iterator[slice]:
-    """Slices that cut a batch of `size` elements, each of `copies` n x n matrices, into pieces for the cache."""
-    most = min(4096, max(256, CACHE_BYTES // (8 * n * n * max(copies, 1))))
-    step = -(-size // -(-size // most)) if size else 1
-    return (slice(i, min(i + step, size)) for i in range(0, size, step))
-
-
+@either
 def inverse(P: Floats) -> Floats:
     """P^-1 (n, n, B) of symmetric positive definite P."""
     out = np.empty(P.shape, P.dtype)
@@ -101,6 +64,7 @@ def inverse(P: Floats) -> Floats:
     return out
 
 
+@either
 def sweep(P: Floats) -> tuple[Floats, Floats, Floats]:
     """P^-1 (n, n, B), det P (B,) and margin (B,), in one elimination.
 
@@ -117,6 +81,7 @@ def sweep(P: Floats) -> tuple[Floats, Floats, Floats]:
     return out, det, margin
 
 
+@either
 def inverse_det(P: Floats) -> tuple[Floats, Floats, Floats]:
     """P^-1 (n, n, B), det P (B,) and its least reciprocal pivot (B,), which is positive if all pivots are.
 
@@ -198,6 +163,7 @@ def _square(W: Floats) -> None:
         W[:i, i] = W[i, :i]
 
 
+@either
 def ldl(P: Floats) -> tuple[Floats, Floats]:
     """Factors of P = L diag(d) L': unit lower triangular L (n, n, B) and pivots d (n, B)."""
     n = P.shape[0]
@@ -214,6 +180,7 @@ def ldl(P: Floats) -> tuple[Floats, Floats]:
     return L, d
 
 
+@either
 def _pivots(P: Floats) -> Floats:
     n = len(P)
     out = np.empty(P.shape[1:], P.dtype)
@@ -250,6 +217,7 @@ def logdet(P: Floats) -> Floats:
     return total
 
 
+@either
 def solve(P: Floats, x: Floats) -> Floats:
     """P^-1 x (n, B) for x (n, B)."""
     n = P.shape[0]
@@ -262,6 +230,7 @@ def solve(P: Floats, x: Floats) -> Floats:
     return y
 
 
+@either
 def quadratic(P: Floats, x: Floats) -> Floats:
     """x' P^-1 x (B,) for x (n, B): the squared Mahalanobis distance."""
     L, d = ldl(P)
@@ -318,6 +287,7 @@ def symmetrise(P: Floats) -> Floats:
     return out
 
 
+@either
 def matvec(A: Floats, x: Floats) -> Floats:
     """A x, (m, B): x (n, B), A (m, n, B), or one A (m, n) for the whole batch."""
     if A.ndim == 2:
@@ -335,6 +305,7 @@ def outer(x: Floats, y: Floats) -> Floats:
     return out
 
 
+@either
 def product(A: Floats, B: Floats) -> Floats:
     """A B, (m, n, B), for A (m, k, B) and B (k, n, B)."""
     with np.errstate(all="ignore"):
@@ -344,6 +315,7 @@ def product(A: Floats, B: Floats) -> Floats:
     return out
 
 
+@either
 def inner(A: Floats, B: Floats) -> Floats:
     """tr(A B), (B,), for symmetric A and B."""
     with np.errstate(all="ignore"):
@@ -373,6 +345,7 @@ def total(a: Floats) -> Floats:
     return out
 
 
+@either
 def congruence(F: Floats, P: Floats) -> Floats:
     """F P F' (m, m, B), exactly symmetric: P (n, n, B), F (m, n, B), or one F (m, n) for the whole batch.
 

@@ -54,9 +54,14 @@ def predict(
     """
     if not np.any(dt):
         return means.copy(), covariances.copy()
-    moves, noise = transition(motion, space, means, dt, frame)
+    turning = motion.kind == "ct" and turns(space, frame)
+    # one F and Q for all where all go as far: the same bits
+    once = not turning and dt.ndim == 1 and bool((dt == dt[0]).all())
+    moves, noise = transition(motion, space, means[:, :1] if once else means, dt[:1] if once else dt, frame)
+    if once:
+        moves = moves[..., 0]
     with np.errstate(all="ignore"):
-        if motion.kind == "ct" and turns(space, frame):
+        if turning:
             w = space.index("turn_rate")
             straight = means.copy()
             straight[w] = 0.0
@@ -65,6 +70,8 @@ def predict(
         else:
             predicted = matvec(moves, means)
         spread = congruence(moves, covariances) + noise
+    if once:
+        return predicted, spread
     same = dt == 0
     return np.where(same, means, predicted), np.where(same, covariances, spread)
 

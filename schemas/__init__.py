@@ -1,6 +1,7 @@
 """What crosses the bus: state spaces, messages, codec, key expressions. WIRE.md says it in words."""
 
 from schemas.codec import MAX_BYTES, VERSION, decode, digest, encode
+from schemas.deltas import Wholes, merged, tracks_at
 from schemas.errors import REASONS, FusionError, MessageError
 from schemas.extents import MAX_EXTENT, REFERENCES, SHAPES
 from schemas.keys import (
@@ -89,6 +90,7 @@ __all__ = [
     "Status",
     "StepLog",
     "Truth",
+    "Wholes",
     "centre_source",
     "check_name",
     "check_numbers",
@@ -100,8 +102,10 @@ __all__ = [
     "encode",
     "global_key",
     "local_key",
+    "merged",
     "pack_lower",
     "parse_key",
+    "tracks_at",
     "truth_key",
     "unpack_lower",
 ]

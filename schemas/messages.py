@@ -200,6 +200,7 @@ class GlobalTracks(Header):
     identity, kind: what it is, a text or None per track, with the probabilities identity_p and kind_p (T,);
     track_origin (T,) u8 index into `ORIGINS`; marks (T,) u8, bits of `MARKS`; number (T,) u32 and callsign: how
     an operator has named it (0, None: not). extent, extent_sigma (T, 3), shape: fused, as in `LocalTracks`.
+    delta: these are only the tracks that have changed since the last picture (see `schemas.merged`); None: all.
     revised: time, ns, of the earliest step that was made again before this one, for data that came late; None: none.
     """
 
@@ -239,6 +240,7 @@ class GlobalTracks(Header):
     extent: Floats | None = None
     extent_sigma: Floats | None = None
     shape: str | None = None
+    delta: bool | None = None
     revised: int | None = None
 
 
@@ -289,7 +291,7 @@ class StepLog(Header):
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Status(Header):
     """Health of a centre. Counters grow since its start; `sources` maps a name to its own small map;
-    `notes` are sentences about the centre that an operator should read."""
+    `notes` are sentences about the centre that an operator should read; `road`: what small matrices are computed by."""
 
     type: ClassVar[str] = "status"
     time: int
@@ -304,6 +306,7 @@ class Status(Header):
     step_time: dict[str, float]
     memory: int | None = None
     notes: tuple[str, ...] | None = None
+    road: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -171,6 +171,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _EXTENT,
         _SIGMA,
         _SHAPE,
+        _plain("delta", values.boolean, optional=True),
         _plain("revised", values.nanoseconds, optional=True),
     ),
     StepLog: (
@@ -200,6 +201,7 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("step_time", _FLOATS, values.pack_floats),
         _plain("memory", values.u64, optional=True),
         _plain("notes", values.list_of(values.text), list, optional=True),
+        _plain("road", values.text, optional=True),
     ),
     Truth: (
         *_HEADER,

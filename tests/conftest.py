@@ -1,8 +1,13 @@
+import os
 from collections.abc import Iterator
 
 import pytest
 
+from fusion_service.compiled.road import VARIABLE
 from tests.helpers.processes import Hub
+
+# The road of small matrices changes no bit: processes start on the plain one, which needs no compiler.
+os.environ.setdefault(VARIABLE, "off")
 
 
 @pytest.fixture(scope="session")

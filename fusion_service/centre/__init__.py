@@ -1,10 +1,11 @@
 """The whole job with no clock, no thread, no socket: events in, one step at a time, pictures and logs out."""
 
+from fusion_service.centre.arrival import ArrivalClock
 from fusion_service.centre.centre import Centre, StepResult
 from fusion_service.centre.checkpoint import CheckpointError
 from fusion_service.centre.clock import MessageClock, WallClock
 from fusion_service.centre.era import ClockSet, NewEra
-from fusion_service.centre.events import Event, Refused, SourceFound, SourceLost
+from fusion_service.centre.events import Event, Refused, Skipped, SourceFound, SourceLost
 from fusion_service.centre.fusion import FusionCentre
 from fusion_service.centre.intensity import IntensityCentre
 from fusion_service.centre.judging import Outcome, View, judge
@@ -15,6 +16,7 @@ from fusion_service.order import NEEDED, WHAT, LocalId, Order, order_of, read_or
 __all__ = [
     "NEEDED",
     "WHAT",
+    "ArrivalClock",
     "Centre",
     "CheckpointError",
     "ClockSet",
@@ -27,6 +29,7 @@ __all__ = [
     "Order",
     "Outcome",
     "Refused",
+    "Skipped",
     "SourceFound",
     "SourceLost",
     "StepResult",

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import groupby
 from typing import Any
 
 import numpy as np
@@ -19,10 +20,11 @@ from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import Source
-from fusion_service.centre.standing import turned
+from fusion_service.centre.standing import heading_sigma_of, turned
 from fusion_service.centre.stated_registration import shift_of
 from fusion_service.centre.tracks import LINKS, Columns, Tracks, join_tracks, no_parts
-from fusion_service.centre.treatment import treated
+from fusion_service.centre.treatment import Treatment, treated
+from fusion_service.config import SourceConfig
 from fusion_service.densities import Mixtures
 from schemas import Entry, Frame, Motion
 
@@ -31,70 +33,103 @@ __all__ = ["predict_tracks", "usable_rows", "write_back"]
 PARTS = ("log_weight", "part_mean", "part_covariance")
 
 
+@dataclass(frozen=True, slots=True)
+class _Used:
+    """A source whose tracks are used: its place in the sorted names, what holds for it, its table."""
+
+    number: int
+    source: Source
+    said: SourceConfig
+    treatment: Treatment
+    table: Tracks
+
+
 def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     """Every source's newest tracks at `time`, ns, by its declared motion. What is stale leaves its table, and
     so does what has no sound density there (refused: ill-conditioned); what is not used, and why, is told."""
     config = intake.config
-    parts: list[Tracks] = []
-    index: list[NDArray[np.intp]] = []
-    epochs: list[NDArray[np.uint64]] = []
-    starts: list[NDArray[np.bool_]] = []
-    interval: list[NDArray[np.int64]] = []
-    lost: list[NDArray[np.bool_]] = []
-    gates: list[NDArray[np.float64]] = []
-    kept: dict[str, int] = {}
-    room = MAX_TOTAL // max(len(intake.sources), 1)
-    for number, (name, source) in enumerate(sorted(intake.sources.items())):
-        said = intake.declared(source)
-        table = retire(source, said, time, room, config)
-        if source.muted or not intake.ready(source):
-            leave_out(source)
-            continue
-        treatment = intake.treatment(name)
-        predicted = _brought(intake, source, table, time)
-        sound = linalg.is_positive_definite(predicted.covariance) & np.isfinite(predicted.mean).all(axis=0)
-        count = int(sound.sum())
-        if count < len(sound):
-            journal.refuse(Entry(name, source.epoch, 0, 0, "ill-conditioned", len(sound) - count))
-            source.tracks = table.take(sound)
-        kept[name] = count
-        parts.append(predicted.take(sound))
-        index.append(np.full(count, number, dtype=np.intp))
-        epochs.append(np.full(count, max(source.epoch, 0), dtype=np.uint64))  # -1: nothing was heard of it yet
-        starts.append(np.full(count, said.may_start and not treatment.out, dtype=np.bool_))
-        interval.append(table.interval[sound])
-        lost.append(np.full(count, source.alive is False, dtype=np.bool_))
-        gate = config.gate if said.gate is None else said.gate
-        gates.append(np.tile(chi2_by_size(gate, len(config.space))[:, None], count))
-    if not parts:
-        parts.append(intake.nothing())
-    tracks = join_tracks(parts)
-    whose = _joined(index, np.intp)
-    treatments = [intake.treatment(name) for name in intake.names()]
+    used, counts, tracks = _sound_tracks(intake, _used(intake, time), time, journal)
+    n = len(config.space)
+
+    def each(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:
+        return np.repeat(np.array(values, dtype=kind), counts)
+
+    whose = each([one.number for one in used], np.intp)
+    gates = [chi2_by_size(config.gate if one.said.gate is None else one.said.gate, n) for one in used]
     kin = kinship.of_rows(intake, tracks, whose)
+    may_start = each([one.said.may_start and not one.treatment.out for one in used], np.bool_)
     return Rows(
         source=whose,
-        epoch=_joined(epochs, np.uint64),
+        epoch=each([max(one.source.epoch, 0) for one in used], np.uint64),  # -1: nothing was heard of it yet
         tracks=tracks,
-        may_start=_joined(starts, np.bool_) & ~kinship.stale_echo(tracks, kin.echo, time, config),
-        interval=_joined(interval, np.int64),
-        lost=_joined(lost, np.bool_),
-        gate=np.concatenate([np.zeros((len(config.space) + 1, 0)), *gates], axis=1),
+        may_start=may_start & ~kinship.stale_echo(tracks, kin.echo, time, config),
+        interval=tracks.interval,
+        lost=each([one.source.alive is False for one in used], np.bool_),
+        gate=np.repeat(np.array(gates).T.reshape(n + 1, -1), counts, axis=1),
         fresh=tracks.updated > tracks.judged,
-        kept=kept,
+        kept={one.source.name: count for one, count in zip(used, counts.tolist(), strict=True)},
         kin=kin,
-        out=np.array([one.out for one in treatments], dtype=np.bool_)[whose],
-        union=np.array([one.union for one in treatments], dtype=np.bool_)[whose],
+        out=each([one.treatment.out for one in used], np.bool_),
+        union=each([one.treatment.union for one in used], np.bool_),
     )
 
 
-def _brought(intake: Intake, source: Source, table: Tracks, time: int) -> Tracks:
-    """The tracks of a source at `time`, ns, in the picture's space, after its treatment, with the errors that all of
-    them have in common."""
-    config, treatment = intake.config, intake.treatment(source.name)
+def _used(intake: Intake, time: int) -> list[_Used]:
+    """The sources whose tracks are used, by name; of all the stale ones leave their tables."""
+    used: list[_Used] = []
+    room = MAX_TOTAL // max(len(intake.sources), 1)
+    for number, (name, source) in enumerate(sorted(intake.sources.items())):
+        said = intake.declared(source)
+        table = retire(source, said, time, room, intake.config)
+        if source.muted or not intake.ready(source):
+            leave_out(source)
+        else:
+            used.append(_Used(number, source, said, intake.treatment(name), table))
+    return used
+
+
+def _sound_tracks(
+    intake: Intake, used: list[_Used], time: int, journal: Journal
+) -> tuple[list[_Used], NDArray[np.intp], Tracks]:
+    """The sources, how many tracks of each there are, and these one after the other at `time`, ns. Sources whose
+    tracks need nothing but the same motion are brought there together."""
+    parts: list[Tracks] = []
+    for _, run in groupby(used, key=lambda one: _alike(intake, one)):
+        alike = [*run]
+        joined = alike[0].table if len(alike) == 1 else join_tracks([one.table for one in alike])
+        parts.append(_brought(intake, alike[0], joined, time))
+    whole = len(parts) == 1 and len(used) > 1
+    tracks = parts[0] if whole else join_tracks(parts or [intake.nothing()])
+    counts = np.array([len(one.table.id) for one in used], dtype=np.intp)
+    sound = linalg.is_positive_definite(tracks.covariance) & np.isfinite(tracks.mean).all(axis=0)
+    if sound.all():
+        return used, counts, tracks
+    ends = np.cumsum(counts)
+    for one, end, count in zip(used, ends.tolist(), counts.tolist(), strict=True):
+        mine = sound[end - count : end]
+        bad = count - int(mine.sum())
+        if bad:
+            journal.refuse(Entry(one.source.name, one.source.epoch, 0, 0, "ill-conditioned", bad))
+            one.source.tracks = one.table.take(mine)
+    return used, np.array([len(one.source.tracks.id) for one in used], dtype=np.intp), tracks.take(sound)
+
+
+def _alike(intake: Intake, one: _Used) -> tuple[Any, ...]:
+    """What sources whose tracks are brought to the step together have in common; those that need more than their
+    motion stand alone."""
+    source, table = one.source, one.table
+    plain = one.treatment.plain and not len(table.log_weight) and not len(table.extent)
+    if plain and intake.config.kind == "tracks":
+        plain = not heading_sigma_of(source) and shift_of(intake, source) is None
+    return one.said.motion, source.space, -1 if plain else one.number
+
+
+def _brought(intake: Intake, one: _Used, table: Tracks, time: int) -> Tracks:
+    """Tracks of a source, or of sources that are alike, at `time`, ns, in the picture's space, after its treatment,
+    with the errors that all of them have in common."""
+    config, treatment, source = intake.config, one.treatment, one.source
     age = np.maximum(time - table.time + treatment.clock, 0) / 1e9
-    motion = intake.declared(source).motion
-    tracks = predict_tracks(table, motion, source.space, config.space, age, intake.frame, config.unknown_speed)
+    tracks = predict_tracks(table, one.said.motion, source.space, config.space, age, intake.frame, config.unknown_speed)
     if config.kind != "tracks":
         return tracks
     tracks = treated(tracks, config.space, treatment)
@@ -110,10 +145,6 @@ def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:
     more = shift[:, :, None]
     parts = tracks.part_covariance + more[..., None]
     return replace(tracks, covariance=tracks.covariance + more, part_covariance=parts)
-
-
-def _joined(parts: list[NDArray[Any]], kind: type[np.generic]) -> NDArray[Any]:
-    return np.concatenate([np.zeros(0, kind), *parts])
 
 
 def predict_tracks(

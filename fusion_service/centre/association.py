@@ -20,7 +20,18 @@ from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints
 from fusion_service.densities import Mixtures, log_sum
 
-__all__ = ["by_size", "candidate_pairs", "cluster", "leave_one_out", "overlap", "pair_distance", "uniform_ci"]
+__all__ = [
+    "CROWDED",
+    "by_size",
+    "candidate_pairs",
+    "cluster",
+    "leave_one_out",
+    "near_pairs",
+    "overlap",
+    "pair_distance",
+    "uniform_ci",
+    "within",
+]
 
 Label = TypeVar("Label", bound=np.generic)
 
@@ -31,6 +42,7 @@ SOUND = 1e-10
 SOUND_WIDE = 1e-13 if np.finfo(np.longdouble).eps < 2e-19 else 1.0
 TIERS = (8, 64)
 """Neighbours sought of a row, and again of one that has as many; one that has the last number is crowded."""
+CROWDED = TIERS[-1]
 CROWD = 256
 """Partners sought of a crowded row, shared evenly between the sources."""
 CHUNK = 4096
@@ -141,6 +153,19 @@ def candidate_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints
     ones (to within a thousandth of the smallest sigma) the place in the canonical order decides: coincident
     sources are paired first with first, second with second.
     """
+    return near_pairs(positions, sigma, reach, source)[:2]
+
+
+def within(positions: Floats, sigma: Floats, reach: float, source: Ints, one: Ints, two: Ints) -> NDArray[np.bool_]:
+    """Which of the pairs (K,) are pairs of `candidate_pairs`."""
+    square = ((positions[:, one] - positions[:, two]) ** 2).sum(axis=0)
+    near = square <= (1 + 1e-9) * reach**2 * (sigma[one] ** 2 + sigma[two] ** 2)
+    near &= (one != two) & ((source[one] != source[two]) | (source[one] < 0))
+    return np.asarray(near)
+
+
+def near_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints) -> tuple[Ints, Ints, bool]:
+    """`candidate_pairs`, and whether any row is crowded."""
     count = len(sigma)
     fit = np.flatnonzero(np.isfinite(positions).all(axis=0) & np.isfinite(sigma))
     sigma = np.maximum(sigma, 1e-9)
@@ -152,9 +177,7 @@ def candidate_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints
     keys: list[Ints] = [np.zeros(0, dtype=np.intp)]
 
     def keep(one: Ints, two: Ints) -> None:
-        square = ((positions[:, one] - positions[:, two]) ** 2).sum(axis=0)
-        near = square <= (1 + 1e-9) * reach**2 * (sigma[one] ** 2 + sigma[two] ** 2)
-        near &= (one != two) & ((source[one] != source[two]) | (source[one] < 0))
+        near = within(positions, sigma, reach, source, one, two)
         one, two = one[near], two[near]
         keys.append(np.minimum(one, two) * count + np.maximum(one, two))
 
@@ -184,7 +207,7 @@ def candidate_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints
             keep(rows[one], rows_b[two])
     key = np.sort(np.concatenate(keys))
     key = key[np.diff(key, prepend=-1) > 0]
-    return key // max(count, 1), key % max(count, 1)
+    return key // max(count, 1), key % max(count, 1), any(map(len, crowded))
 
 
 def _chunks(rows: Ints) -> Iterator[Ints]:

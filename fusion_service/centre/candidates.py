@@ -15,12 +15,13 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints
-from fusion_service.centre.association import candidate_pairs, overlap
+from fusion_service.centre.association import overlap
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import Judgement
 from fusion_service.centre.identity import Terms
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.meeting import Meeting
+from fusion_service.centre.neighbours import Neighbours
 from fusion_service.centre.partial import Unknown, apart
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.densities import Mixtures
@@ -65,9 +66,9 @@ class Candidates:
 
 
 def find_candidates(
-    rows: Rows, now: Picture, meeting: Meeting, judged: Judgement, tests: Tests, places: list[int]
+    rows: Rows, now: Picture, meeting: Meeting, judged: Judgement, tests: Tests, places: list[int], beside: Neighbours
 ) -> Candidates:
-    """All that may meet. now: the picture predicted to the step."""
+    """All that may meet. now: the picture predicted to the step; beside: who was near in the last one."""
     tracks, agreed = rows.tracks, judged.agreed
     mean, covariance = now.mean.copy(), now.covariance.copy()
     at = now.find(agreed.labels)
@@ -82,7 +83,8 @@ def find_candidates(
     seen = np.asarray(tests.unknown.known(covariances).all(axis=1))
     places = [place for place in places if seen[place]]  # where a height is not known, pairs are sought on the plane
     sigma = np.sqrt(sum(covariances[place, place] for place in places))
-    i, j = candidate_pairs(means[places], sigma, float(np.sqrt(gates.max(initial=tests.gate[-1]))), source)
+    reach = float(np.sqrt(gates.max(initial=tests.gate[-1])))
+    i, j = beside.pairs(now.id[known], means[places], sigma, reach, source)
     same = compartment[i] == compartment[j]
     i, j = i[same], j[same]
     first_row, second_row = i >= len(known), j >= len(known)

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
+from fusion_service.centre.deltas import Deltas, fed
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
-from fusion_service.centre.events import Event
+from fusion_service.centre.events import Event, Skipped
 from fusion_service.centre.history import History, Past
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.intake import Intake
@@ -46,11 +47,12 @@ __all__ = ["Centre", "StepResult"]
 
 @dataclass(frozen=True, slots=True)
 class StepResult:
-    """What one step gives."""
+    """What one step gives. tracks: as they are published, which may be a delta; picture: all of them."""
 
     tracks: GlobalTracks
     log: StepLog
     status: Status
+    picture: GlobalTracks
 
 
 class Centre(ABC):
@@ -85,6 +87,7 @@ class Centre(ABC):
         self._time = -1
         self._journal = Journal(self.config.name, self.config_hash, __version__)
         self._era = EraWatch(self.config)
+        self._deltas = Deltas(self.config)
         self._begin()
         if checkpoint is not None:
             state, self._picture = unpack_state(checkpoint, self._intake, self._labels)
@@ -110,7 +113,9 @@ class Centre(ABC):
         era = self._era.judge(event, received, self._time)
         if era is not None:
             self._begin_era(era, received)
-        if not isinstance(event, (ClockSet, NewEra)):
+        if isinstance(event, Skipped):
+            self._journal.event({"kind": "skipped", "steps": event.steps})
+        elif not isinstance(event, (ClockSet, NewEra)):
             self._intake.put(event, received)
             self._history.note(event, received)
 
@@ -131,7 +136,7 @@ class Centre(ABC):
         revised = self._revise()
         contributions = self._make(time)
         journal = self._journal
-        tracks = picture_message(
+        picture = picture_message(
             self._picture,
             self._intake,
             journal,
@@ -144,11 +149,12 @@ class Centre(ABC):
             rule=self._rule,
             revised=revised,
         )
+        tracks = self._deltas.of(picture, fed(self._intake.sources.values()))
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         notes = self._era.notes(time)
         status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), notes, self._watched())
-        return StepResult(tracks, log, self._history.told_in(status))
+        return StepResult(tracks, log, self._history.told_in(status), picture)
 
     def _make(self, time: int, events: tuple[tuple[Event, int], ...] | None = None, left: int = 0) -> Contributions:
         """Make the step at `time`, ns, as far as it changes the state, and remember what went into it. events: of a

@@ -72,7 +72,8 @@ class Compartments:
 
     def _now(self, ids: Ids, rows: Rows, names: tuple[str, ...]) -> tuple[Origins, Codes]:
         origin, apart = np.zeros(len(ids), dtype=np.uint8), np.full(len(ids), NONE, dtype=np.int32)
-        if not len(ids):
+        plain = not (self.origin.any() or rows.tracks.origin.any() or (self.apart != NONE).any())
+        if not len(ids) or (plain and not self._intake.orders.about("quarantine")):
             return origin, apart
         if len(self.track):
             at = np.minimum(np.searchsorted(self.track, ids), len(self.track) - 1)

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.derived import MOST_MEMBERS, Followed
 from fusion_service.centre.intake import Intake
+from fusion_service.centre.kept_weights import KeptWeights
 from fusion_service.centre.lifecycle import WAYS
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import Source
@@ -37,6 +38,8 @@ BY_CROSS, BY_DERIVED, BY_DECLARED, BY_CI, BY_UNION = (
 )
 EACH = ("max_correlation", "cross_covariance")
 """Options that have an element for each fusion."""
+WEIGHED = ("ci", "bci")
+"""Rules whose best weights a step may take over from the last one."""
 ENOUGH = 0.05
 """What may be left of the unknown start of a pair whose cross-covariance is taken as known."""
 
@@ -46,13 +49,15 @@ class Correlation:
     """How the rows of a step are fused by the rule of the config, with what is known of their correlation.
 
     groups (S,): of each source, by sorted name, the number of its group; bounds (G, G): between two of the groups.
-    None where nothing is declared by groups. followed: pairs whose cross-covariance is derived.
+    None where nothing is declared by groups. followed: pairs whose cross-covariance is derived. kept: the weights of
+    the last step, None where the best are wanted.
     """
 
     config: CentreConfig
     groups: Ints | None = None
     bounds: Floats | None = None
     followed: Followed | None = None
+    kept: KeptWeights | None = None
 
     def fuse(
         self, rows: Rows, members: Ints, means: Floats, covariances: Floats, weights: Floats | None, some: Ints
@@ -73,8 +78,19 @@ class Correlation:
             return self._as_known(rows, members, means, covariances, some, options)
         if self.groups is not None:
             options["max_correlation"] = self._between(rows, members)
-        fused = fuse_last(rule, means, covariances, weights, influence=True, **options)
+        start = self._start(rows, members) if rule in WEIGHED and weights is None else None
+        fused = fuse_last(rule, means, covariances, weights, influence=True, start=start, **options)
+        if rule in WEIGHED:
+            self._note(rows, members, fused.weights)
         return fused, np.zeros(len(members), dtype=np.uint8)
+
+    def _start(self, rows: Rows, members: Ints) -> Floats | None:
+        """The weights (N, B) of the last step."""
+        return None if self.kept is None else self.kept.of(rows.tracks.link[members[:, 0]], members.shape[1])
+
+    def _note(self, rows: Rows, members: Ints, weights: Floats) -> None:
+        if self.kept is not None:
+            self.kept.note(rows.tracks.link[members[:, 0]], weights)
 
     def _sure(
         self,
@@ -113,8 +129,11 @@ class Correlation:
         size, N = members.shape
         few = {name: value for name, value in options.items() if name not in ("max_correlation", "cross")}
         followed = self.followed if 1 < N <= MOST_MEMBERS else None
+        start = self._start(rows, members)
         if followed is None and self.groups is None:
-            return fuse_last("ci", means, covariances, influence=True, **few), np.full(size, BY_CI, dtype=np.uint8)
+            fused = fuse_last("ci", means, covariances, influence=True, start=start, **few)
+            self._note(rows, members, fused.weights)
+            return fused, np.full(size, BY_CI, dtype=np.uint8)
         R, C, unknown = np.ones((N, N, size)), None, np.ones(size)
         if followed is not None:
             R, whole, unknown = followed.of(members)
@@ -126,11 +145,12 @@ class Correlation:
         exact = _part("bar-shalom-campo", means, covariances, known, cross_covariance=C)
         known &= np.isfinite(exact.covariance[0, 0]) & (exact.covariance[0, 0] > 0.0)
         bounded &= ~known
-        under = _part("bci", means, covariances, bounded, max_correlation=R, **few)
+        under = _part("bci", means, covariances, bounded, start, max_correlation=R, **few)
         neither = ~known & ~bounded
-        safe = _part("ci", means, covariances, neither, **few)
+        safe = _part("ci", means, covariances, neither, start, **few)
         columns = zip(_columns(exact), _columns(under), _columns(safe), strict=True)
         fused = Fused(*(np.where(known, a, np.where(bounded, b, c)) for a, b, c in columns))
+        self._note(rows, members, np.where(known, np.nan, fused.weights))
         way = np.where(known, BY_CROSS, np.where(bounded, np.where(derived, BY_DERIVED, BY_DECLARED), BY_CI))
         return fused, way.astype(np.uint8)
 
@@ -143,13 +163,16 @@ def _doubted(rows: Rows, members: Ints) -> Bools:
     return np.asarray(union[members].any(axis=1))
 
 
-def _part(rule: str, means: Floats, covariances: Floats, some: Bools, **options: Any) -> Fused:
+def _part(
+    rule: str, means: Floats, covariances: Floats, some: Bools, start: Floats | None = None, **options: Any
+) -> Fused:
     """The fusions of some elements, in a batch in which the others are NaN."""
     N, n, size = means.shape
     whole = Fused(*(np.full((*shape, size), np.nan) for shape in ((n,), (n, n), (N,), (N,))))
     if some.any():
         options |= {name: options[name][..., some] for name in EACH if name in options}
-        part = fuse_last(rule, means[..., some], covariances[..., some], influence=True, **options)
+        begin = None if start is None else start[:, some]
+        part = fuse_last(rule, means[..., some], covariances[..., some], influence=True, start=begin, **options)
         for column, wide in zip(_columns(part), _columns(whole), strict=True):
             wide[..., some] = column
     return whole
@@ -160,17 +183,19 @@ def _columns(fused: Fused) -> tuple[Floats, Floats, Floats, Floats]:
     return fused.mean, fused.covariance, fused.weights, fused.influence
 
 
-def declared_correlation(intake: Intake, config: CentreConfig, followed: Followed | None = None) -> Correlation:
+def declared_correlation(
+    intake: Intake, config: CentreConfig, followed: Followed | None = None, kept: KeptWeights | None = None
+) -> Correlation:
     """What the sources declare of it now, and what is known of pairs of rows."""
     bounds = group_bounds(config.rule_options) if config.rule in ("bci", AUTO) else None
     if bounds is None:
-        return Correlation(config, followed=followed)
+        return Correlation(config, followed=followed, kept=kept)
     named = [intake.declared(source).correlation_group or name for name, source in sorted(intake.sources.items())]
     groups = sorted(set(named))
     number = {name: i for i, name in enumerate(groups)}
     size = len(groups), len(groups)
     between = np.array([[bounds.of(first, second) for second in groups] for first in groups]).reshape(size)
-    return Correlation(config, np.array([number[name] for name in named], dtype=np.intp), between, followed)
+    return Correlation(config, np.array([number[name] for name in named], dtype=np.intp), between, followed, kept)
 
 
 def declared_motions(intake: Intake) -> list[Motion | None]:

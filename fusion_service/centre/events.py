@@ -9,7 +9,7 @@ from fusion_service.centre.era import ClockSet, NewEra
 from fusion_service.order import Order
 from schemas import Message
 
-__all__ = ["Event", "Refused", "SourceFound", "SourceLost"]
+__all__ = ["Event", "Refused", "Skipped", "SourceFound", "SourceLost"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,4 +36,11 @@ class Refused:
     dropped: bool = False
 
 
-Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused | ClockSet | NewEra
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """So many steps before the next one are not made, since the service is behind: told in the log."""
+
+    steps: int
+
+
+Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused | Skipped | ClockSet | NewEra

@@ -20,12 +20,12 @@ needs `A` together, of young ones less. A link that was only just made breaks on
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import Rows
@@ -34,6 +34,7 @@ from fusion_service.metrics import chi2_quantile
 
 __all__ = ["LOW", "PairEvidence", "RivalLinks", "Tests", "chi2_by_size"]
 
+Ids = NDArray[np.uint64]
 LOW = 12.0
 """Least sum of a rival: how much it must make good before it counts."""
 SLOPE = 0.2
@@ -92,62 +93,95 @@ class Tests:
         return np.asarray(self.bound * np.interp(data, *WEIGHT))
 
 
+class PairSums(NamedTuple):
+    """K pairs (older, newer) of global ids, sorted: total, the sum; first, second: the newest datum of each when it was
+    added, ns, -1: none; parted: one was split from the other."""
+
+    older: Ids
+    newer: Ids
+    total: Floats
+    first: NDArray[np.int64]
+    second: NDArray[np.int64]
+    parted: Bools
+
+    def take(self, some: Any) -> PairSums:
+        """Those given."""
+        return PairSums(*(column[some] for column in self))
+
+    def join(self, other: PairSums) -> PairSums:
+        """Both, sorted."""
+        both = PairSums(*(np.concatenate(pair) for pair in zip(self, other, strict=True)))
+        return both.take(np.lexsort((both.newer, both.older)))
+
+    @classmethod
+    def of(cls, pairs: list[tuple[int, int, float, int, int, bool]]) -> PairSums:
+        """From rows, sorted."""
+        columns = list(zip(*pairs, strict=True)) or [()] * len(_KINDS)
+        return cls(*(np.array(column, dtype=kind) for column, kind in zip(columns, _KINDS, strict=True)))
+
+
+_KINDS = (np.uint64, np.uint64, np.float64, np.int64, np.int64, np.bool_)
+
+
 @dataclass(slots=True)
 class PairEvidence:
-    """Sums about pairs of global ids, for a merge: {(older, newer): (sum, newest datum of each when it was added)}.
-    parted: those of them of which one was split from the other."""
+    """Sums about pairs of global ids, for a merge."""
 
-    pairs: dict[tuple[int, int], tuple[float, int, int]] = field(default_factory=dict)
-    parted: set[tuple[int, int]] = field(default_factory=set)
+    sums: PairSums = field(default_factory=lambda: PairSums.of([]))
 
     def add(self, first: Ints, second: Ints, amount: Floats, picture: Picture, bound: float) -> None:
-        """Add to the pairs of rows of the picture that are near now, where both have new data since the last time;
-        every other pair is forgotten, but for those that were parted."""
-        kept: dict[tuple[int, int], tuple[float, int, int]] = {}
-        ids, seen = picture.id, picture.seen
-        columns = (ids[first], ids[second], amount, seen[first], seen[second])
-        for a, b, more, new_a, new_b in zip(*(column.tolist() for column in columns), strict=True):
-            total, old_a, old_b = self.pairs.get((a, b), (0.0, -1, -1))
-            if new_a > old_a and new_b > old_b:
-                total = min(max(total + more, -bound), bound)
-                old_a, old_b = new_a, new_b
-            kept[a, b] = (total, old_a, old_b)
-        there = set(ids.tolist()) if any(pair not in kept for pair in self.parted) else set()
-        self.parted = {pair for pair in self.parted if pair in kept or there.issuperset(pair)}
-        self.pairs = kept | {pair: self.pairs[pair] for pair in sorted(self.parted - kept.keys()) if pair in self.pairs}
+        """Add to the pairs (first, second), in order, of rows of the picture that are near now, where both have new
+        data since the last time; every other pair is forgotten, but for those that were parted, while both live."""
+        old, ids, width = self.sums, picture.id, max(len(picture.id), 1)
+        if not len(first) and not len(old.older):
+            return
+        at, to = (np.minimum(picture.find(one), width - 1) for one in (old.older, old.newer))
+        alive = (ids[at] == old.older) & (ids[to] == old.newer) if len(ids) else np.zeros(len(at), dtype=np.bool_)
+        old, known, asked = old.take(alive), at[alive] * width + to[alive], first * width + second
+        place = np.minimum(np.searchsorted(known, asked), max(len(known) - 1, 0))
+        there = known[place] == asked if len(known) else np.zeros(len(asked), dtype=np.bool_)
+        total, new_a, new_b = np.zeros(len(asked)), picture.seen[first], picture.seen[second]
+        old_a, old_b = np.full((2, len(asked)), -1, dtype=np.int64)
+        parted = np.zeros(len(asked), dtype=np.bool_)
+        for column, kept in ((total, old.total), (old_a, old.first), (old_b, old.second), (parted, old.parted)):
+            column[there] = kept[place[there]]
+        both = (new_a > old_a) & (new_b > old_b)
+        total = np.where(both, np.clip(total + amount, -bound, bound), total)
+        old_a, old_b = np.where(both, new_a, old_a), np.where(both, new_b, old_b)
+        near = np.zeros(len(known), dtype=np.bool_)
+        near[place[there]] = True
+        self.sums = PairSums(ids[first], ids[second], total, old_a, old_b, parted).join(old.take(old.parted & ~near))
 
     def part(self, old: int, new: int, bound: float) -> None:
         """`new` was split from `old`: to merge them again takes the way from the other end."""
-        self.parted.add((old, new))
-        self.pairs[old, new] = (-bound, -1, -1)
+        others = self.sums.take((self.sums.older != np.uint64(old)) | (self.sums.newer != np.uint64(new)))
+        self.sums = others.join(PairSums.of([(old, new, -bound, -1, -1, True)]))
 
     def ripe(self, bound: float) -> list[tuple[int, int]]:
         """Pairs decided for a merge, most certain and then oldest first."""
-        full = [(-total, pair) for pair, (total, _, _) in self.pairs.items() if total >= bound - 1e-9]
-        return [pair for _, pair in sorted(full)]
+        full = self.sums.take(self.sums.total >= bound - 1e-9)
+        full = full.take(np.lexsort((full.newer, full.older, -full.total)))
+        return list(zip(full.older.tolist(), full.newer.tolist(), strict=True))
 
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns: no datum is later."""
-        self.pairs = {pair: (total, min(a, time), min(b, time)) for pair, (total, a, b) in self.pairs.items()}
+        first, second = np.minimum(self.sums.first, time), np.minimum(self.sums.second, time)
+        self.sums = self.sums._replace(first=first, second=second)
 
     def forget(self, tracks: set[int]) -> None:
         """Drop the pairs of these global ids."""
-        self.pairs = {pair: kept for pair, kept in self.pairs.items() if not tracks & set(pair)}
-        self.parted = {pair for pair in self.parted if not tracks & set(pair)}
+        if tracks:
+            gone = np.array(sorted(tracks), dtype=np.uint64)
+            self.sums = self.sums.take(~(np.isin(self.sums.older, gone) | np.isin(self.sums.newer, gone)))
 
     def packed(self) -> list[Any]:
         """As plain values, in order."""
-        return [[*pair, *kept, pair in self.parted] for pair, kept in sorted(self.pairs.items())]
+        return list(zip(*(column.tolist() for column in self.sums), strict=True))
 
     @classmethod
     def unpacked(cls, packed: list[Any]) -> PairEvidence:
         """From what `packed` gave."""
-        made = cls()
-        for a, b, total, first, second, parted in packed:
-            made.pairs[int(a), int(b)] = (float(total), int(first), int(second))
-            if parted:
-                made.parted.add((int(a), int(b)))
-        return made
+        return cls(PairSums.of([tuple(one) for one in packed]))
 
 
 @dataclass(slots=True)

@@ -140,7 +140,7 @@ class Ruled:
     def kin(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
         """Groups whose rows have data in common (see `kinship`): what is derived of rows holds for no result of
         them."""
-        ruled = replace(self, known=replace(self.known, followed=None))
+        ruled = replace(self, known=replace(self.known, followed=None, kept=None))
 
         def by_rule(x: Floats, P: Floats, which: list[int], some: Ints) -> kinship.Estimates:
             return kinship.Estimates(*ruled.fuse(x, P, None, some, np.zeros(len(some), dtype=np.uint8), which))

@@ -164,10 +164,13 @@ class FusionCentre(Centre):
         self, rows: Rows, shared: Shared, inside: NDArray[np.intp], at: NDArray[np.intp], count: int, time: int
     ) -> Support:
         """What feeds each global track. A report is overdue by half of its interval, or a step, whichever is longer;
-        where the source's token is gone, by nothing."""
+        where the source's token is gone, by nothing; where data of it were dropped, it is not."""
         interval = rows.interval[inside]
         slack = np.maximum(interval // 2, round(self.config.period * 1e9))
         expected = rows.tracks.seen[inside] + interval + np.where(rows.lost[inside], 0, slack)
+        expected = np.where(
+            self._intake.spared.of(self._intake.names())[rows.source[inside]], np.maximum(expected, time), expected
+        )
         due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
         np.maximum.at(due, at, expected)
         np.maximum.at(slowest, at, interval)

@@ -17,12 +17,13 @@ not take another source to test.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from fusion_service import linalg
 from fusion_service.arrays import Bools, Floats
+from fusion_service.centre.tracks import taken
 from fusion_service.centre.versions import Versions
 
 __all__ = ["Increments", "increments"]
@@ -33,6 +34,8 @@ process noise that is declared a tenth too small."""
 RIDGE = 0.05
 """Of P_-, added to P_- - P, which has the rank of the measurement only: directions in which less than that is gained
 count for little, so that a process noise declared a tenth too large does not count as freedom."""
+DEFINITE = 1e-14
+"""Margin from which a covariance is positive definite, as in `linalg`."""
 LITTLE = 0.5
 """An innovation of less freedom says nothing."""
 LARGEST = 50.0
@@ -53,11 +56,23 @@ class Increments:
 
     def take(self, at: Any) -> Increments:
         """The given ones (indices or a mask)."""
-        return Increments(*(getattr(self, one.name)[..., at] for one in fields(self)))
+        return cast(Increments, taken(self, at))
 
 
 def increments(versions: Versions) -> Increments:
     """The increments of versions."""
+    n, count = versions.mean.shape
+    out = Increments(
+        np.empty((n, n, count)), np.empty((n, count)), np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
+    )
+    for part in linalg.blocks(n, count, 4):
+        for one, column in zip(fields(out), _of_block(versions.take(part)), strict=True):
+            getattr(out, one.name)[..., part] = column
+    return out
+
+
+def _of_block(versions: Versions) -> tuple[Floats, Floats, Floats, Floats, Bools]:
+    """The columns of the increments of some versions."""
     before, after = versions.predicted_covariance, versions.covariance
     with np.errstate(all="ignore"):
         old, _, first = linalg.sweep(before)
@@ -67,13 +82,12 @@ def increments(versions: Versions) -> Increments:
         vector = linalg.matvec(new, step)
         gained = before - after
         ridged = gained + RIDGE * before
-        freedom = linalg.inner(linalg.inverse(ridged), gained)
+        inverse, _, third = linalg.sweep(ridged)
+        freedom = linalg.inner(inverse, gained)
         innovation = np.minimum(linalg.quadratic(ridged, step), LARGEST * np.maximum(freedom, 1.0))
         sound = (np.minimum(first, second) > 0) & np.isfinite(vector).all(axis=0)
         sound &= np.isfinite(information).all(axis=(0, 1))
         sound &= linalg.is_positive_definite(information + NEGATIVE * old)
-        judged = np.isfinite(innovation) & np.isfinite(freedom) & linalg.is_positive_definite(ridged)
+        judged = np.isfinite(innovation) & np.isfinite(freedom) & (third > DEFINITE)
         counted = judged & (freedom > LITTLE)
-    return Increments(
-        information, vector, np.where(counted, innovation, 0.0), np.where(counted, freedom, 0.0), sound & judged
-    )
+    return information, vector, np.where(counted, innovation, 0.0), np.where(counted, freedom, 0.0), sound & judged

@@ -17,7 +17,7 @@ from fusion_service.centre import notes
 from fusion_service.centre.clock import horizon
 from fusion_service.centre.declared import declared_by, loosened, motion_declared, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
-from fusion_service.centre.events import Event, Refused, SourceFound, SourceLost
+from fusion_service.centre.events import Event, Refused, Skipped, SourceFound, SourceLost
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
 from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, silence
@@ -28,6 +28,7 @@ from fusion_service.centre.pictures import as_scan, is_picture_of, source_of
 from fusion_service.centre.refusing import fault
 from fusion_service.centre.scans import Scan, as_tracks, message_tracks, size_of
 from fusion_service.centre.sources import Source
+from fusion_service.centre.spared import Spared
 from fusion_service.centre.tracks import Tracks, empty_tracks
 from fusion_service.centre.treatment import AS_IT_IS, Treatment
 from fusion_service.centre.words import Lexicon, Words
@@ -86,6 +87,7 @@ class Intake:
         self._given: list[Order] = []
         self._present: dict[str, bool] = {}
         self._refused: Counter[tuple[str, str, bool]] = Counter()
+        self.spared = Spared(config)
         self._dead: list[str] | None = None
 
     def put(self, event: Event, received: int) -> None:
@@ -99,7 +101,7 @@ class Intake:
                 self._given.append(event)
         elif isinstance(event, Refused):
             self._count(event.source, event.reason, max(event.count, 1), event.dropped)
-        elif isinstance(event, (ClockSet, NewEra)):
+        elif isinstance(event, (ClockSet, NewEra, Skipped)):
             return
         elif self._is_full(event):
             self._count(source_of(event), "pending", 1, dropped=True)
@@ -218,6 +220,7 @@ class Intake:
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):
             (journal.drop if dropped else journal.refuse)(Entry(name, 0, 0, 0, reason, count))
+        self.spared.note({name for name, _, dropped in self._refused if dropped}, time)
         self._present, self._refused = {}, Counter()
         self._accept(self._due(time, journal), time, last, journal)
 

@@ -69,29 +69,43 @@ def silence(interval: I64, said: SourceConfig, config: CentreConfig) -> I64:
 def intervals(id: NDArray[np.uint64], time: I64, known: Remembered, pace: Pace) -> I64:
     """The interval (T,) of each of the reports of tracks `id` (T,) at `time` (T,), ns; `known`: what they were before.
     An id may be there several times: its newest report has what all of them give."""
-    count = len(id)
+    if (id[1:] > id[:-1]).all():
+        interval, before = _before(id, known, pace)
+        return _after(interval, np.where(before >= 0, time - before, 0), pace)
     order = np.lexsort((time, id))
     ids, times = id[order], time[order]
-    first = np.append(True, ids[1:] != ids[:-1]) if count else np.zeros(0, dtype=np.bool_)
-    interval, before = np.full(count, pace.first, dtype=np.int64), np.full(count, -1, dtype=np.int64)
-    if len(known.id) and count:
-        at = np.minimum(np.searchsorted(known.id, ids), len(known.id) - 1)
-        was = known.id[at] == ids
-        interval[was], before[was] = known.interval[at][was], known.time[at][was]
+    first = np.append(True, ids[1:] != ids[:-1])
+    interval, before = _before(ids, known, pace)
     begin = np.flatnonzero(first)
-    size = np.diff(np.append(begin, count))
+    size = np.diff(np.append(begin, len(ids)))
     last = begin + size - 1
     previous = np.where(first, before, np.maximum(np.roll(times, 1), before))
     gap = np.where(previous >= 0, times - previous, 0)
     now = interval[begin]
-    for back in range(int(min(size.max(initial=0), MOST_GAPS)) - 1, -1, -1):
+    for back in range(min(int(size.max()), MOST_GAPS) - 1, -1, -1):
         there = size > back
-        step = gap[np.where(there, last - back, 0)] if count else gap
-        longer = np.maximum(np.maximum(step, now - (now - step) // 2), pace.floor)
-        now = np.where(there & (step > 0), np.minimum(longer, pace.cap), now)
-    out = np.empty(count, dtype=np.int64)
+        now = np.where(there, _after(now, gap[np.where(there, last - back, 0)], pace), now)
+    out = np.empty(len(ids), dtype=np.int64)
     out[order] = np.repeat(now, size)
     return out
+
+
+def _before(ids: NDArray[np.uint64], known: Remembered, pace: Pace) -> tuple[I64, I64]:
+    """Interval and time of the last report, -1 without, of tracks `ids`."""
+    interval, before = np.full(len(ids), pace.first, dtype=np.int64), np.full(len(ids), -1, dtype=np.int64)
+    if len(known.id) == len(ids) and (known.id == ids).all():
+        return known.interval, known.time
+    if len(known.id) and len(ids):
+        at = np.minimum(np.searchsorted(known.id, ids), len(known.id) - 1)
+        was = known.id[at] == ids
+        interval[was], before[was] = known.interval[at][was], known.time[at][was]
+    return interval, before
+
+
+def _after(interval: I64, gap: I64, pace: Pace) -> I64:
+    """Intervals after one more gap each, ns; as they were where that is not positive."""
+    longer = np.maximum(np.maximum(gap, interval - (interval - gap) // 2), pace.floor)
+    return np.where(gap > 0, np.minimum(longer, pace.cap), interval)
 
 
 def remember(known: Remembered, retired: Remembered, there: NDArray[np.uint64], oldest: int, most: int) -> Remembered:

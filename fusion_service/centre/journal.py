@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.compiled import PLAIN, road
 from fusion_service.config.settings import recordable
 from schemas import Decisions, Entry, StepLog, messages
 
@@ -34,6 +35,8 @@ def start_event(config: CentreConfig, epoch: int, generation: int | None, checkp
         start |= {"checkpoint": checkpoint} if len(checkpoint) <= MOST_LOGGED else {"left_out": len(checkpoint)}
     if generation is not None:
         start["generation"] = generation
+    if road() != PLAIN:
+        start["road"] = road()
     return start
 
 

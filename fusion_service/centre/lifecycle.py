@@ -26,6 +26,8 @@ from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 __all__ = ["WAYS", "Picture", "Support", "advance", "empty_picture", "newborn"]
 
+FEW, WIDEST = 512, 8
+"""Ids that are looked up one by one; and how many times more numbers than ids there may be for a table."""
 WAYS = ("", "tracklet", "bar-shalom-campo derived", "bci derived", "bci declared", "ci", "cu")
 """What a track may be fused by: "" is the rule of the config."""
 
@@ -76,8 +78,18 @@ class Picture:
         return as_mixtures(self, rows)
 
     def find(self, ids: NDArray[np.uint64]) -> NDArray[np.intp]:
-        """Rows of ids that are in the picture."""
-        return np.searchsorted(self.id, ids)
+        """Rows of ids that are in the picture: where each would be inserted. Ids are counted up, so that of many the
+        place is mostly read off a table of how many are below each number there is."""
+        if len(ids) < FEW or len(self.id) < 2:
+            return np.searchsorted(self.id, ids)
+        first, width = self.id[0], int(self.id[-1] - self.id[0]) + 1
+        if width > WIDEST * (len(self.id) + len(ids)):
+            return np.searchsorted(self.id, ids)
+        below = np.zeros(width + 2, dtype=np.intp)
+        below[(self.id - first).astype(np.intp) + 1] = 1
+        np.cumsum(below, out=below)
+        at = np.where(ids > first, np.minimum(ids - first, np.uint64(width)), np.uint64(0))
+        return below[at.astype(np.intp)]
 
     def join(self, other: Picture) -> Picture:
         """Both, one after the other: sorted where the ids of `other` are above all of these (see `order`)."""

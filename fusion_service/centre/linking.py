@@ -29,6 +29,7 @@ from fusion_service.centre.ids import Ids
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture, newborn
 from fusion_service.centre.meeting import Meeting
+from fusion_service.centre.neighbours import Neighbours
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.tracks import set_links
 from fusion_service.config import CentreConfig
@@ -55,6 +56,7 @@ class Linker:
         self.merges = PairEvidence()
         self.rivals = RivalLinks()
         self.copies = Copies(config)
+        self._beside = Neighbours()
         self._ids = ids
         self._settings = Settings(self.tests, config.space, config.manoeuvre)
         n = len(config.space)
@@ -71,7 +73,7 @@ class Linker:
         """
         meeting.settle(step, journal)
         judged = judge(rows, now, meeting.forced_row, time, self._settings, journal)
-        near = find_candidates(rows, now, meeting, judged, self.tests, self._places)
+        near = find_candidates(rows, now, meeting, judged, self.tests, self._places, self._beside)
         near = _without_broken(near, rows, now, judged)
         joined = self._assign(rows, now, _vacant(near, meeting), step, journal)
         merged = self._merge(rows, now, near, step, journal)
@@ -198,6 +200,8 @@ class Linker:
     def _shadow(self, rows: Rows, now: Picture, near: Candidates, meeting: Meeting, free: Ints) -> Bools:
         """Hold loose rows whose source already follows the track that they are near; (F,) which may begin one."""
         tracks, tests = rows.tracks, self.tests
+        if not len(free):
+            return np.zeros(0, dtype=np.bool_)
         joins = near.joins.take(np.isin(near.joins.first, free))
         holds = _held(rows, now, joins.first, joins.second)
         joins = joins.take(holds)
@@ -261,16 +265,19 @@ class Linker:
     def _merge(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> dict[int, int]:
         """Join global tracks that share no source and that the evidence says are one: {newer id: older id}."""
         pairs = near.tracks
-        masks = _masks(rows, now)
-        apart = (masks[pairs.first] & masks[pairs.second]) == 0
-        pairs = pairs.take(apart)
+        if len(pairs.first):
+            masks = _masks(rows, now)
+            pairs = pairs.take((masks[pairs.first] & masks[pairs.second]) == 0)
         same = self.tests.sameness(pairs.distance, pairs.size)
         self.merges.add(pairs.first, pairs.second, same, now, self.tests.bound)
-        far = dict(zip(zip(now.id[pairs.first].tolist(), now.id[pairs.second].tolist(), strict=True),
-                       pairs.distance.tolist(), strict=True))  # fmt: skip
+        ripe = self.merges.ripe(self.tests.bound)
+        far: dict[tuple[int, int], float] = {}
+        if ripe:
+            ids = zip(now.id[pairs.first].tolist(), now.id[pairs.second].tolist(), strict=True)
+            far = dict(zip(ids, pairs.distance.tolist(), strict=True))
         merged: dict[int, int] = {}
         taken: set[int] = set()
-        for old, new in self.merges.ripe(self.tests.bound):
+        for old, new in ripe:
             if not taken & {old, new}:
                 taken |= {old, new}
                 merged[new] = old
@@ -311,6 +318,8 @@ def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgemen
 
 def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
     """Which of the pairs (row, track): the row's source has another, believed row in the track."""
+    if not len(row):
+        return np.zeros(0, dtype=np.bool_)
     inside = rows.inside()
     width = max(len(now.id), 1)
     keys = np.unique(rows.source[inside] * width + now.find(rows.tracks.link[inside]))

@@ -22,6 +22,7 @@ from fusion_service.centre.fusing import fuse_all, with_parts
 from fusion_service.centre.increments import Increments, increments
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.kept_weights import KeptWeights
 from fusion_service.centre.lifecycle import WAYS, Picture
 from fusion_service.centre.motions import Motions, States
 from fusion_service.centre.partial import AXES, PLACED, Unknown
@@ -45,6 +46,7 @@ class Memory:
         self._config = intake.config
         self.motions = Motions(intake)
         self.watch = Watch()
+        self.weights = KeptWeights() if self._config.weights == "kept" else None
         self._begin()
 
     def _begin(self) -> None:
@@ -58,8 +60,16 @@ class Memory:
     ) -> tuple[Picture, Floats]:
         """The picture of the step at `time`, ns, and the influence (M,) of each row, as `fusing.fuse_all`. before:
         the picture after the last step, `now` the same predicted to `time`."""
+        fused = self._fuse(rows, names, before, now, step, time, journal)
+        if self.weights is not None:
+            self.weights.turn()
+        return fused
+
+    def _fuse(
+        self, rows: Rows, names: tuple[str, ...], before: Picture, now: Picture, step: int, time: int, journal: Journal
+    ) -> tuple[Picture, Floats]:
         if not self._config.follows:
-            known = declared_correlation(self._intake, self._config)
+            known = declared_correlation(self._intake, self._config, None, self.weights)
             picture, influence = fuse_all(rows, now, time, known, journal)
             return self._moving(rows, names, picture), influence
         if self._frame != self._intake.frame:
@@ -73,7 +83,7 @@ class Memory:
         capable = self._capable(rows, names)
         filtered = np.append(self._filtered(now, before, at, capable), False)
         followed = self._followed(rows, names, versions, ~filtered[at], time, journal)
-        known = declared_correlation(self._intake, self._config, followed)
+        known = declared_correlation(self._intake, self._config, followed, self.weights)
         if not self._config.by_tracklets:
             picture, influence = fuse_all(rows, now, time, known, journal)
             none = np.zeros(len(versions.row), dtype=np.bool_)
@@ -253,12 +263,15 @@ class Memory:
             "frame": repr(self._intake.frame), "space": list(self._config.space), "motions": self.motions.packed(),
             "watch": self.watch.packed(), "filters": self.filters.packed(),
         }  # fmt: skip
+        packed |= {"weights": self.weights.packed()} if self.weights is not None else {}
         return packed | ({"derived": self.derived.packed()} if len(self.derived) else {})
 
     def restore(self, packed: dict[str, Any]) -> None:
         """From what `packed` gave; without what is in another frame or space."""
         self.motions.restore(packed["motions"])
         self._frame = self._intake.frame
+        if self.weights is not None:
+            self.weights.restore(packed.get("weights", []))
         if self._config.follows:
             self.watch.restore(packed["watch"])
         if packed["frame"] != repr(self._intake.frame) or packed.get("space") != list(self._config.space):

@@ -62,9 +62,12 @@ class Unknown:
 
     def known(self, covariance: Floats) -> NDArray[np.bool_]:
         """Which components (n, ...) of densities with `covariance` (n, n, ...) are known."""
-        variance = np.moveaxis(np.diagonal(covariance), -1, 0)
-        limit: Floats = self.limit.reshape(-1, *(1,) * (variance.ndim - 1))
-        return np.logical_not(np.greater_equal(variance, limit))
+        known = np.ones(covariance.shape[1:], dtype=np.bool_)
+        for k, limit in enumerate(self.limit.tolist()):
+            if limit < np.inf:
+                np.greater_equal(covariance[k, k], limit, out=known[k])
+                np.logical_not(known[k], out=known[k])
+        return known
 
     def told(self, covariance: Floats) -> Floats:
         """Covariances (n, n, ...) as they are published: padding that is just large enough to be known as such, so that
@@ -113,6 +116,8 @@ def patterns(known: Bools) -> Iterator[tuple[Ints, Any]]:
 
 def brought(mean: Floats, covariance: Floats, space: tuple[str, ...], unknown: Unknown) -> tuple[Floats, Floats]:
     """Densities (m, ...), (m, m, ...) of `space` in that of `unknown`: marginalised, and padded."""
+    if space == unknown.space:
+        return mean, covariance
     old = np.array([space.index(name) for name in unknown.space if name in space], dtype=np.intp)
     if len(old) == len(unknown.space):
         return mean[old], covariance[np.ix_(old, old)]
@@ -145,22 +150,26 @@ def predict_known(
     besides gone at some speed (one sigma, m/s, on each axis) since `age` (B,) seconds before: speed^2 ((age + dt)^2 -
     age^2) is added to its variance, so that many short steps give what one long one does.
     """
-    out_mean = np.empty((len(unknown.space), *mean.shape[1:]))
-    out_covariance = np.empty((len(unknown.space), *out_mean.shape))
-    count = mean.shape[1]
-    for some, at in patterns(known):
-        names = tuple(space[k] for k in some.tolist())
-        x, P = mean[some][..., at], covariance[np.ix_(some, some)][..., at]
-        gone = dt[at]
+    ages = np.broadcast_to(age, dt.shape)
+
+    def moved(names: tuple[str, ...], x: Floats, P: Floats, gone: Floats, since: Floats) -> tuple[Floats, Floats]:
         m, shape = len(names), x.shape
-        moved, spread = predict(motion, names, x.reshape(m, -1), P.reshape(m, m, -1), np.tile(gone, count), frame)
+        one, spread = predict(motion, names, x.reshape(m, -1), P.reshape(m, m, -1), np.tile(gone, shape[1]), frame)
         spread = spread.reshape(m, *shape)
-        since = np.broadcast_to(age, dt.shape)[at]
         for place, velocity in AXES:
             if velocity in unknown.space and place in names and velocity not in names and motion.kind not in PLACED:
                 k = names.index(place)
                 spread[k, k] += speed**2 * gone * (gone + 2.0 * since)
-        out_mean[..., at], out_covariance[..., at] = brought(moved.reshape(shape), spread, names, unknown)
+        return brought(one.reshape(shape), spread, names, unknown)
+
+    if known.all():
+        return moved(space, mean, covariance, dt, ages)
+    out_mean = np.empty((len(unknown.space), *mean.shape[1:]))
+    out_covariance = np.empty((len(unknown.space), *out_mean.shape))
+    for some, at in patterns(known):
+        names = tuple(space[k] for k in some.tolist())
+        part = mean[some][..., at], covariance[np.ix_(some, some)][..., at]
+        out_mean[..., at], out_covariance[..., at] = moved(names, *part, dt[at], ages[at])
     return out_mean, out_covariance
 
 

@@ -2,8 +2,8 @@
 
 A global track stands as a local track of the same id: its density, existence, identity and class, and as `updated` the
 time of the newest measurement in it, so that a track that only coasts brings nothing new. What that centre tracks
-apart, since its operator does not trust the source, is left out. It is always the whole picture: a track that has ended
-is gone.
+apart, since its operator does not trust the source, is left out. A full picture is a complete scan: a track that has
+ended is gone. A delta is a partial one: it says nothing of what it does not list.
 """
 
 from __future__ import annotations
@@ -50,8 +50,9 @@ def is_own(message: Message, config: CentreConfig) -> bool:
 
 
 def as_scan(message: Message, config: CentreConfig, frame: Frame | None = None) -> Message:
-    """The picture of a centre that the config names as a source, or of the own one, as a complete scan; any other
-    message, and what does not belong together, as it is. frame: that in which a picture without tracks says so."""
+    """The picture of a centre that the config names as a source, or of the own one, as a scan, complete unless it is a
+    delta; any other message, and what does not belong together, as it is. frame: that in which a picture without
+    tracks says so."""
     if not isinstance(message, GlobalTracks) or not _fits(message):
         return message
     if source_of(message) not in config.sources and message.source != config.name:
@@ -73,7 +74,7 @@ def as_scan(message: Message, config: CentreConfig, frame: Frame | None = None) 
         origin=message.origin,
         lineage=message.lineage or (message.source,),
         time=message.time,
-        complete=True,
+        complete=not message.delta,
         space=message.space,
         frame=spoken,
         ids=message.ids[some],

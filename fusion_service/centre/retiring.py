@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from fusion_service.arrays import Ints
 from fusion_service.centre import notes
 from fusion_service.centre.intervals import Remembered, remember, silence
 from fusion_service.centre.sources import Source
@@ -11,6 +12,8 @@ from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig, SourceConfig
 
 __all__ = ["leave_out", "retire"]
+
+NOTHING: Ints = np.zeros(0, dtype=np.intp)
 
 
 def retire(source: Source, said: SourceConfig, time: int, room: int, config: CentreConfig) -> Tracks:
@@ -24,14 +27,15 @@ def retire(source: Source, said: SourceConfig, time: int, room: int, config: Cen
     if retired:
         source.tracks = table.take(~late)
     oldest = time - round(config.remember * 1e9)
-    gone = Remembered(table.id[late], table.time[late], table.interval[late])
-    source.remembered = remember(source.remembered, gone, source.tracks.id, oldest, room)
-    new = np.isin(table.id, np.concatenate(source.arrived)) & late if retired and source.arrived else late & False
-    source.leave("stale", int(new.sum()))
-    if source.arrived and new.sum() < sum(len(ids) for ids in source.arrived):
-        source.why = ""
-    elif new.any():
-        newest = int(np.where(new, age, np.iinfo(np.int64).max).argmin())
+    if retired or len(source.remembered.id):
+        gone = Remembered(table.id[late], table.time[late], table.interval[late])
+        source.remembered = remember(source.remembered, gone, source.tracks.id, oldest, room)
+    new = np.flatnonzero(late) if retired and source.arrived else NOTHING
+    if len(new):
+        new = new[np.isin(table.id[new], np.concatenate(source.arrived))]
+        source.leave("stale", len(new))
+    if len(new) and len(new) >= sum(len(ids) for ids in source.arrived):
+        newest = new[age[new].argmin()]
         source.why = notes.stale(age[newest] / 1e9, limit[newest] / 1e9)
     elif source.arrived:
         source.why = ""

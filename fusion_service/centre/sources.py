@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
 from fusion_service.centre.places import Place, followed
-from fusion_service.centre.tracks import Pair, Tracks, empty_tracks, newest, successive
+from fusion_service.centre.tracks import Pair, Tracks, by_id, empty_tracks, join_tracks, renewed
 from schemas import LocalTracks, SensorInfo
 
 __all__ = ["REMEMBERED", "Source"]
@@ -120,15 +120,19 @@ class Source:
     ) -> bool:
         """Take the tracks of a complete scan, or of partial ones in a row; what a complete scan does not list is
         gone. versions: keep them. False, and nothing is changed, if there would be more than `most` tracks."""
-        space, complete = messages[-1].space, messages[-1].complete
-        new = new.take(new.time >= self.complete)
+        space, complete, end = messages[-1].space, messages[-1].complete, messages[-1].time
+        new = by_id(new.take(new.time >= self.complete))
         old = self.tracks if space == self.space else empty_tracks(len(space))
         new = replace(new, interval=intervals(new.id, new.time, self._known(old), pace))
-        merged, pair = newest(old, new), successive(old, new) if versions else None
-        end, gone = messages[-1].time, merged.link[:0]
-        if complete and end >= self.complete:
-            listed = np.isin(merged.id, messages[-1].ids) | (merged.time > end)
-            merged, gone = merged.take(listed), merged.link[~listed]
+        merged, stays, pair = renewed(old, new, versions)
+        gone = old.link[:0]
+        if complete and end >= self.complete and stays.any():
+            listed = ~stays | (old.time > end)
+            listed[~listed] = np.isin(old.id[~listed], messages[-1].ids)
+            stays, gone = stays & listed, old.link[~listed]
+        if stays.any():
+            merged = join_tracks([old.take(stays), merged])
+            merged = merged.take(np.argsort(merged.id, kind="stable"))
         if len(merged.id) > most:
             return False
         self.dropped.append(gone)

@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, ClassVar, Protocol, TypeAlias, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.words import Codes
 from fusion_service.densities import Mixtures
 
@@ -25,14 +25,15 @@ __all__ = [
     "Pair",
     "Tracks",
     "as_mixtures",
+    "by_id",
     "empty_tracks",
     "join_tracks",
-    "newest",
     "no_parts",
     "padded",
     "relinked",
+    "renewed",
     "set_links",
-    "successive",
+    "taken",
     "unlinked",
 ]
 
@@ -107,8 +108,8 @@ class Tracks:
     told: NDArray[np.int64]
 
     def take(self, rows: Any) -> Tracks:
-        """The given rows (indices or a mask)."""
-        return Tracks(*(getattr(self, one.name)[..., rows] for one in fields(self)))
+        """The given rows (indices or a mask); the same where the mask holds for all."""
+        return cast(Tracks, taken(self, rows))
 
     def mixtures(self, rows: Any) -> Mixtures:
         """The densities of the given rows as mixtures."""
@@ -231,21 +232,78 @@ def padded(tracks: Columns, components: int) -> Columns:
     return replace(tracks, log_weight=log_weight, part_mean=mean, part_covariance=covariance)
 
 
-def newest(old: Tracks, new: Tracks) -> Tracks:
-    """Both, sorted by id, the newest of each id (the later given where times are equal), links kept unless the
-    origin has changed.
+def taken(columns: Any, rows: Any) -> Any:
+    """Columns, (..., T) each, of the given rows (indices or a mask): the same ones where a mask holds for all."""
+    names = [one.name for one in fields(columns)]
+    if not isinstance(rows, np.ndarray) or rows.dtype != np.bool_:
+        return type(columns)(*(getattr(columns, name)[..., rows] for name in names))
+    if rows.all():
+        return columns
+    at = np.flatnonzero(rows)
+    return type(columns)(*(getattr(columns, name).take(at, axis=-1, mode="clip") for name in names))
 
-    `old` is sorted by id; `new` may hold an id several times.
-    """
-    if len(old.id) and len(new.id):
-        at = np.minimum(np.searchsorted(old.id, new.id), len(old.id) - 1)
-        known = (old.id[at] == new.id) & (old.origin[at] == new.origin)
-        kept = {name: np.where(known, getattr(old, name)[at], getattr(new, name)) for name in LINKS}
-        new = replace(new, **kept)
-    both = join_tracks([old, new])
-    order = np.lexsort((np.arange(len(both.id)), both.time, both.id))
-    last = np.append(both.id[order][1:] != both.id[order][:-1], True) if len(order) else np.zeros(0, dtype=np.bool_)
-    return both.take(order[last])
+
+def by_id(tracks: Tracks) -> Tracks:
+    """The same, sorted by id; those of one id in the order of time, or as given where times are equal."""
+    ids = tracks.id
+    if (ids[1:] > ids[:-1]).all():
+        return tracks
+    return tracks.take(np.lexsort((tracks.time, ids)))
+
+
+class Step(NamedTuple):
+    """What a report makes of a table: the new versions (T,), sorted by id and one of each, with the links of the old
+    ones; stays (O,): which rows of the old table they do not replace; pair: the new versions that hold a newer
+    measurement than the ones before, beside these, None where there is none (or they were not asked for)."""
+
+    new: Tracks
+    stays: Bools
+    pair: Pair | None
+
+
+def renewed(old: Tracks, new: Tracks, versions: bool = False) -> Step:
+    """The step from a table, sorted by id, to what a report says, `new` (as `by_id`; it may hold an id several times):
+    of each id the newest counts, the later given where times are equal. Links are kept unless the origin has changed.
+    versions: give the pairs too."""
+    last = np.append(new.id[1:] != new.id[:-1], np.ones(min(len(new.id), 1), dtype=np.bool_))
+    pair = successive(old, new) if versions and not last.all() else None
+    single, new = last.all(), new.take(last)
+    at, there = _places(old.id, new.id)
+    beaten = there & (old.time[at] > new.time) if len(old.id) else there
+    if beaten.any():
+        new, at, there = new.take(~beaten), at[~beaten], there[~beaten]
+    stays = np.ones(len(old.id), dtype=np.bool_)
+    stays[at[there]] = False
+    if not there.any():
+        return Step(_alike(old, new), stays, pair)
+    whole = len(at) == len(old.id) and bool(there.all())
+    was = old if whole else old.take(at)
+    same = there & (was.origin == new.origin)
+    if versions and single:
+        later = same & (new.updated > was.updated)
+        pair = (was.take(later), new.take(later)) if later.any() else None
+    if same.all():
+        kept = {name: getattr(was, name) for name in LINKS}
+    else:
+        kept = {name: np.where(same, getattr(was, name), getattr(new, name)) for name in LINKS}
+    return Step(_alike(old, replace(new, **kept)), stays, pair)
+
+
+def _places(ids: NDArray[np.uint64], some: NDArray[np.uint64]) -> tuple[Ints, Bools]:
+    """Where each of `some` (K,) stands in `ids`, sorted, and whether it does."""
+    if len(ids) == len(some) and (ids == some).all():
+        return np.arange(len(some)), np.ones(len(some), dtype=np.bool_)
+    if not len(ids):
+        return np.zeros(len(some), dtype=np.intp), np.zeros(len(some), dtype=np.bool_)
+    at = np.minimum(np.searchsorted(ids, some), len(ids) - 1)
+    return at, ids[at] == some
+
+
+def _alike(old: Tracks, new: Tracks) -> Tracks:
+    """The new ones with room for components and extents where the old ones have it."""
+    if len(old.log_weight) <= len(new.log_weight) and len(old.extent) <= len(new.extent):
+        return new
+    return join_tracks([old.take(slice(0, 0)), new])
 
 
 def successive(old: Tracks, new: Tracks) -> Pair | None:

@@ -47,6 +47,11 @@ class Treatment:
     union: bool = False
     lasting: bool = False
 
+    @property
+    def plain(self) -> bool:
+        """Whether the densities of its tracks stay as they are."""
+        return not self.clock and self.correction is None and self.inflation == (1.0, 1.0)
+
 
 AS_IT_IS = Treatment()
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +18,7 @@ from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.align import predict_tracks
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.tracks import Pair, Tracks, join_tracks
+from fusion_service.centre.tracks import Pair, Tracks, join_tracks, taken
 from fusion_service.centre.treatment import Treatment
 from schemas import Motion
 
@@ -45,7 +45,7 @@ class Versions:
 
     def take(self, at: Any) -> Versions:
         """The given ones (indices or a mask)."""
-        return Versions(*(getattr(self, one.name)[..., at] for one in fields(self)))
+        return cast(Versions, taken(self, at))
 
 
 def versions_of(intake: Intake, rows: Rows, time: int) -> Versions:
@@ -59,6 +59,9 @@ def versions_of(intake: Intake, rows: Rows, time: int) -> Versions:
     joined = Versions(
         *(np.concatenate([getattr(part, one.name) for part in parts], axis=-1) for one in fields(Versions))
     )
+    later, same = joined.time[1:] > joined.time[:-1], joined.time[1:] == joined.time[:-1]
+    if (later | same & (joined.row[1:] >= joined.row[:-1])).all():
+        return joined
     return joined.take(np.lexsort((joined.row, joined.time)))
 
 
@@ -90,10 +93,13 @@ def _versions(
     pairs: list[Pair], motion: Motion, inflation: float, space: tuple[str, ...], intake: Intake, ids: Any, start: int
 ) -> Versions:
     """Those of one source, whose rows have these ids (sorted), the first of them being row `start`."""
-    old, new = (join_tracks([pair[side] for pair in pairs]) for side in (0, 1))
-    at = np.minimum(np.searchsorted(ids, new.id), len(ids) - 1)
-    known = ids[at] == new.id
-    old, new, at = _thinned(old.take(known), new.take(known), at[known])
+    old, new = (_densities([pair[side] for pair in pairs]) for side in (0, 1))
+    if len(ids) == len(new.id) and (ids == new.id).all():
+        at = np.arange(len(ids))
+    else:
+        at = np.minimum(np.searchsorted(ids, new.id), len(ids) - 1)
+        known = ids[at] == new.id
+        old, new, at = _thinned(old.take(known), new.take(known), at[known])
     old, new = _as_said(old, inflation), _as_said(new, inflation)
     wanted = intake.config.space
     gone, speed = (new.time - old.time) / 1e9, intake.config.unknown_speed
@@ -102,7 +108,30 @@ def _versions(
     return Versions(at + start, new.time, old.time, predicted.mean, predicted.covariance, now.mean, now.covariance)
 
 
-def _thinned(old: Tracks, new: Tracks, at: Any) -> tuple[Tracks, Tracks, Any]:
+@dataclass(frozen=True, slots=True, eq=False)
+class _Densities:
+    """What of tracks is looked at here: the columns of `Tracks` of these names."""
+
+    id: NDArray[np.uint64]
+    time: NDArray[np.int64]
+    mean: Floats
+    covariance: Floats
+    log_weight: Floats
+    part_mean: Floats
+    part_covariance: Floats
+
+    def take(self, at: Any) -> _Densities:
+        """The given ones (indices or a mask)."""
+        return cast(_Densities, taken(self, at))
+
+
+def _densities(parts: list[Tracks]) -> _Densities:
+    """One after the other."""
+    some = [_Densities(*(getattr(part, one.name) for one in fields(_Densities))) for part in parts]
+    return some[0] if len(some) == 1 else join_tracks(some)
+
+
+def _thinned(old: _Densities, new: _Densities, at: Any) -> tuple[_Densities, _Densities, Any]:
     """At most `MOST_VERSIONS` of each row `at` (K,): the old version of the first of some in a row, and the new one of
     the last. What is between two of them is process noise over a small part of a step."""
     if not len(at) or np.bincount(at).max() <= MOST_VERSIONS:
@@ -116,11 +145,8 @@ def _thinned(old: Tracks, new: Tracks, at: Any) -> tuple[Tracks, Tracks, Any]:
     return old.take(order[first]), new.take(order[last]), row[last]
 
 
-def _as_said(tracks: Tracks, inflation: float) -> Tracks:
+def _as_said(tracks: _Densities, inflation: float) -> _Densities:
     """Covariances before they were inflated."""
     if inflation == 1.0:
         return tracks
-    columns = {one.name: getattr(tracks, one.name) for one in fields(tracks)}
-    columns["covariance"] = tracks.covariance / inflation
-    columns["part_covariance"] = tracks.part_covariance / inflation
-    return Tracks(**columns)
+    return replace(tracks, covariance=tracks.covariance / inflation, part_covariance=tracks.part_covariance / inflation)

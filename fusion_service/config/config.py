@@ -17,6 +17,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
+from fusion_service.compiled import CHOICES
 from fusion_service.config.correlation import is_derived, rule_options
 from fusion_service.config.readers import (
     DURATION,
@@ -43,6 +44,10 @@ from fusion_service.errors import FusionError
 from schemas import ORIGINS, STATUSES, Coverage, Frame, Height, Motion, check_name, check_realm, check_space
 
 __all__ = ["BusConfig", "CentreConfig", "ConfigError", "DaemonConfig", "ServiceConfig", "SourceConfig", "config_hash"]
+
+
+LATER = ("trigger", "arrival_spacing")
+"""Settings that came after hashes were recorded; their defaults are what there was before."""
 
 
 class ConfigError(FusionError, ValueError):
@@ -115,7 +120,13 @@ class CentreConfig:
     frame: Frame | None = _setting(None, read_frame, "frame of the picture; left out: what sources agree on")
     frame_wait: float = _setting(5.0, DURATION, "seconds after which the most supported frame is taken")
     clock: str = _setting("wall", choice("wall", "message"), "step by wall clock, or by the messages' own time")
-    period: float = _setting(1.0, number(0.01, 1e5), "seconds between steps")
+    trigger: str = _setting(
+        "period", choice("period", "arrival"), "step every period, or as soon as a scan is in, at the scan's time"
+    )
+    arrival_spacing: float = _setting(
+        0.002, number(0.0, 10.0), "trigger = arrival: seconds between steps at least; scans that come together are one"
+    )
+    period: float = _setting(1.0, number(0.01, 1e5), "seconds between steps; trigger = arrival: between full pictures")
     delay: float = _setting(0.5, DURATION, "wall clock: how far behind now a step is")
     lateness: float = _setting(5.0, DURATION, "how late a message may be, seconds")
     revise: float = _setting(
@@ -126,6 +137,12 @@ class CentreConfig:
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
     rule: str = _setting("auto", read_rule, "fusion rule (fusion-service rules lists them)")
     rule_options: dict[str, Any] = _setting({}, rule_options, "options of the rule, e.g. {criterion = 'trace'}")
+    weights: str = _setting(
+        "kept",
+        choice("kept", "best"),
+        "rules ci, bci, auto, three sources and more: the best weights in every step, or those of the last one kept "
+        "while within .1 % of the best",
+    )
     mixture_rule: str = _setting("moments", read_mixture_rule, "rule for mixtures; moments: as Gaussians, by the rule")
     mixture_options: dict[str, Any] = _setting({}, table, "options of the mixture rule")
     max_components: int = _setting(8, whole(1, 100), "components kept of a mixture")
@@ -251,6 +268,11 @@ class DaemonConfig:
     state: str | None = _setting(None, maybe(text), "folder for ids and checkpoint; left out: ids by clock, no memory")
     status_period: float = _setting(1.0, number(0.1, 3600), "seconds between status messages")
     log_refusals: float = _setting(1.0, number(0.0, 1000), "log lines about refusals per second and reason at most")
+    compiled: str = _setting(
+        "auto",
+        choice(*CHOICES),
+        "small matrices by loops that numba compiles, same bits: auto, where it is installed",
+    )
 
 
 @dataclass(frozen=True)
@@ -263,8 +285,13 @@ class ServiceConfig:
 
 
 def config_hash(config: CentreConfig) -> str:
-    """A short hash of all settings: equal for equal settings."""
-    plain = json.dumps(dataclasses.asdict(config), sort_keys=True, default=_plain)
+    """A short hash of all settings: equal for equal settings. Those of `LATER` count where they are not as
+    ever."""
+    settings = dataclasses.asdict(config)
+    for one in dataclasses.fields(config):
+        if one.name in LATER and settings[one.name] == one.default:
+            del settings[one.name]
+    plain = json.dumps(settings, sort_keys=True, default=_plain)
     return hashlib.sha256((plain + str(getattr(config.frame, "kind", ""))).encode()).hexdigest()[:16]
 
 

@@ -17,7 +17,7 @@ from fusion_service.config.toml_text import dotted, toml_value
 from fusion_service.demo.crew import Crew, DemoError, client_arguments, free_endpoint, record_arguments
 from fusion_service.demo.missions import MissionPlan, plan_mission, with_faults
 from fusion_service.progress import Progress
-from schemas import GlobalTracks, MessageError, decode, global_key, local_key
+from schemas import GlobalTracks, MessageError, Wholes, decode, global_key, local_key
 
 __all__ = ["START", "run_demo", "write_config"]
 
@@ -33,6 +33,7 @@ class _Watch:
     def __init__(self) -> None:
         self.tokens: set[str] = set()
         self.shown = 0
+        self._wholes = Wholes()
         self.changed = time.monotonic()
 
     def on_token(self, key: str, alive: bool) -> None:
@@ -43,8 +44,8 @@ class _Watch:
             message = decode(data)
         except MessageError:
             return
-        if isinstance(message, GlobalTracks):
-            self.shown, self.changed = int((message.status > 0).sum()), time.monotonic()
+        if isinstance(message, GlobalTracks) and (whole := self._wholes.of(message)) is not None:
+            self.shown, self.changed = int((whole.status > 0).sum()), time.monotonic()
 
 
 def run_demo(

@@ -49,7 +49,8 @@ def kl_gaussians(means: Floats, covariances: Floats, others: Floats, spreads: Fl
         A, det, _ = linalg.sweep(spreads)
         d = means - others
         square = total(d * linalg.matvec(A, d)) + linalg.inner(A, covariances) - len(d)
-        return 0.5 * (square + np.log(det) - linalg.logdet(covariances))
+        out: Floats = 0.5 * (square + np.log(det) - linalg.logdet(covariances))
+    return out
 
 
 def kl_bounds(f: Mixture, g: Mixture) -> tuple[float, float]:

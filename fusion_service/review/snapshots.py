@@ -17,7 +17,7 @@ from fusion_service.arrays import Floats
 from fusion_service.densities import moments
 from fusion_service.geodesy import FrameError, transform
 from fusion_service.motion import predict
-from schemas import Frame, GlobalTracks, LocalTracks, Motion, Truth, check_numbers
+from schemas import Frame, GlobalTracks, LocalTracks, Motion, Truth, check_numbers, merged
 from schemas.messages import TENTATIVE
 
 __all__ = [
@@ -177,7 +177,8 @@ class ShownTracks:
 
     A source shows of its newest epoch the newest version of each track, unless a later complete scan left it out or it
     is older than `limit` seconds; a centre the confirmed and coasting tracks of its newest picture, no older than
-    `limit`. Both predicted with `motion`. Tracks that fail `schemas.check_numbers` are not shown.
+    `limit`; where that is a delta, those of the ones before it, too. Both predicted with `motion`. Tracks that fail
+    `schemas.check_numbers` are not shown.
 
     axes: the position's components, more: further components of the states. Messages are taken in the order of
     `order`; times, too, only ever grow.
@@ -226,7 +227,7 @@ class ShownTracks:
             part = self._coming.popleft()
             message = part.message
             if isinstance(message, GlobalTracks):
-                self._parts, self.picture = [part], message
+                self._show(part, message)
             elif message.epoch >= self._epoch:
                 if message.epoch > self._epoch or message.complete:
                     self._parts, self._epoch = [], message.epoch
@@ -237,6 +238,20 @@ class ShownTracks:
         self._parts = [part for part in self._parts if time - part.message.time <= self._limit]
         if not self._parts:
             self.picture = None
+
+    def _show(self, part: _Part, message: GlobalTracks) -> None:
+        """A picture: all there is, or what has changed in what is shown."""
+        picture = merged(self.picture, message)
+        if picture is None:
+            return
+        if message.delta:
+            gone = np.array([track for track, _, _ in message.ended], dtype=np.uint64)
+            there = self.numbers.find(0, np.concatenate([message.ids, gone]))
+            left = [old.select(~np.isin(old.number, there)) for old in self._parts]
+            part_of = [old for old in left if len(old.number)]
+        else:
+            part_of = []
+        self._parts, self.picture = [*part_of, part], picture
 
     def _block(self, entries: list[tuple[int, _Part]], times: Times) -> Block:
         d, names = len(self._axes), (*self._axes, *self._more)

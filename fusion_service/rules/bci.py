@@ -126,9 +126,7 @@ def _bounded_each(sources: Sources, weights: Floats | None, influence: bool, cri
 
 
 def _taken(sources: Sources, some: Bools) -> Sources:
-    if some.all():
-        return sources
-    return Sources(*(getattr(sources, one.name)[..., some] for one in fields(sources)))
+    return sources if some.all() else sources.take(some)
 
 
 def _joined(parts: list[tuple[Bools, Result]]) -> Result:

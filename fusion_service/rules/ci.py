@@ -24,7 +24,10 @@ from fusion_service.rules.weights import simplex
 from fusion_service.rules.weights.pairs import is_one, of_elements
 from fusion_service.rules.weights.two import best_of_two
 
-__all__ = ["RULE", "ci", "intersection"]
+__all__ = ["KEPT", "RULE", "ci", "intersection"]
+
+KEPT = 1e-3
+"""Weights that are given to start from are kept while their gap is at most this."""
 
 
 def ci(sources: Sources, weights: Floats | None, influence: bool, *, criterion: str) -> Result:
@@ -51,6 +54,8 @@ def intersection(
     the naive rule for 0."""
     model = Inflated(sources.information, rho)
     optimise = weights is None and not (isinstance(rho, float) and rho == 0.0) and sources.count > 1
+    if optimise and sources.start is not None and sources.count > 2:
+        return _from_start(sources, influence, criterion, rho)
     w = sources.uniform if weights is None else weights
     if optimise and sources.count == 2:
         A, P, dets = model.A, sources.covariances, 1.0 / sources.dets
@@ -58,15 +63,37 @@ def intersection(
         w = best_of_two(criterion, *ends, rho=rho)
     elif optimise:
         w = simplex.best_weights(criterion, model, w)
+    return _weighed(sources, model, w, influence, criterion, optimise)
+
+
+def _weighed(
+    sources: Sources, model: "Inflated", w: Floats, influence: bool, criterion: str, optimised: bool
+) -> Result:
+    """The intersection under weights (N, B), with the gap of those that are `optimised`."""
     scale, slope, _ = model.scale(w)
     mean, P, condition = weighted_product(sources, scale)
     gap, share = np.zeros_like(condition), None
-    if optimise:
+    if optimised:
         g = simplex.gradient(criterion, P, model.A)
         gap = simplex.gap(w, g * slope)
     if influence:
-        share = (-g if optimise and criterion == "det" else inner(P[:, :, None], model.A)) * scale / len(P)
+        share = (-g if optimised and criterion == "det" else inner(P[:, :, None], model.A)) * scale / len(P)
     return Result(mean, P, w, share, condition, gap)
+
+
+def _from_start(sources: Sources, influence: bool, criterion: str, rho: float | Floats) -> Result:
+    """With the weights to start from where their gap is at most `KEPT`, they count as given; elsewhere with the best.
+
+    The criterion, det P or trace P, is then at most exp(gap) times the smallest."""
+    assert sources.start is not None
+    result = _weighed(sources, Inflated(sources.information, rho), np.array(sources.start), influence, criterion, True)
+    kept = result.gap <= KEPT
+    result = replace(result, gap=np.where(kept, 0.0, result.gap))
+    anew = np.flatnonzero(~kept)
+    if len(anew):
+        some = sources.take(anew).without_start()
+        result.overwrite(anew, intersection(some, None, influence, criterion, of_elements(rho, anew)))
+    return result
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,8 +1,8 @@
 """Bus + centre + clock + signals + health: the service as a process.
 
 The bus fills a bounded inbox; one loop takes from it, gives the centre what can be decoded, steps when the
-clock says so, saves the checkpoint, and publishes. Nothing that comes in makes it exit: should a step fail,
-the centre goes on from its last checkpoint under a new id generation.
+clock says so, publishes, and saves the checkpoint (see `stepping`). Nothing that comes in makes it exit: should a
+step fail, the centre goes on from its last checkpoint under a new id generation.
 """
 
 from __future__ import annotations
@@ -16,23 +16,25 @@ from typing import NamedTuple
 from fusion_service.bus import Bus, Inbox, open_bus
 from fusion_service.centre import (
     ClockSet,
-    MessageClock,
     Order,
     Refused,
+    Skipped,
     SourceFound,
     SourceLost,
     StepResult,
-    WallClock,
     is_picture_of,
     source_of,
 )
-from fusion_service.config import ServiceConfig
+from fusion_service.compiled import begin
+from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
+from fusion_service.service.overload import Overload, overtaken
 from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker, status_line
 from fusion_service.service.stepping import LastingCentre
+from fusion_service.service.timing import StepTimes
 from fusion_service.service.tokens import Tokens
 from fusion_service.source_words import source_event
 from schemas import (
@@ -52,6 +54,9 @@ from schemas import (
 
 __all__ = ["Service", "run_service"]
 
+KEPT = 32
+"""Pictures and step logs that can be had again by who missed one: the recorder, above all."""
+
 log = logging.getLogger(__name__)
 
 
@@ -64,7 +69,12 @@ class Arrival(NamedTuple):
 
 
 def run_service(config: ServiceConfig, stop: threading.Event) -> None:
-    """Run until `stop` is set. Raises `BusError` or `StateError`, which says in one line why it cannot start."""
+    """Run until `stop` is set. Raises `BusError`, `StateError` or `ConfigError`, which says in one line why it
+    cannot start."""
+    try:
+        begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
+    except ValueError as error:
+        raise ConfigError([f"[service] compiled: {error}"]) from None
     with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop) as bus:
         Service(config, bus, state).run(stop)
 
@@ -82,11 +92,12 @@ class Service:
         self._tokens = Tokens(self._inbox.wake)
         self._desk = OrderDesk(lambda order: self._inbox.put("", order))
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
-        self._message_clock = MessageClock(config.centre) if config.centre.clock == "message" else None
-        self._wall_clock = WallClock(config.centre)
+        self._times = StepTimes(config.centre)
+        self._overload = Overload(self._times.patience)
         self._dropped: Counter[str] = Counter()
         self._result: StepResult | None = None
-        self._picture = b""
+        self._taken = 0
+        """When everything that had come was taken from the inbox, ns."""
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set."""
@@ -99,26 +110,26 @@ class Service:
         status_due = time.monotonic() + self._config.service.status_period
         while not stop.is_set():
             timeout = max(0.0, status_due - time.monotonic())
-            if self._message_clock is None:
-                timeout = min(timeout, self._wall_clock.wait(time.time_ns()))
-            for _, item in self._inbox.take(timeout):
+            for item in self._take(min(timeout, self._times.wait(time.time_ns()))):
                 if stop.is_set():
                     break
                 self._receive(item)
             changed = self._note_tokens()
             self._note_drops()
             self._step_all(stop)
+            self._lasting.save()
             if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
                 notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
         notify("STOPPING=1")
+        self._lasting.save(at_once=True)
         self._publish_status()
         log.info("stopped after %d steps", self._counts["steps"])
 
     def _declare(self) -> None:
         realm, name, bus = self._config.bus.realm, self._config.centre.name, self._bus
         self._out = {
-            what: bus.publisher(global_key(name, what, realm), cache=2 if what == "tracks" else 1)
+            what: bus.publisher(global_key(name, what, realm), cache=KEPT if what != "status" else 1)
             for what in ("tracks", "log", "status")
         }
         bus.watch(local_key("*", "alive", realm), self._tokens.note)
@@ -147,11 +158,23 @@ class Service:
         self._counts["missed"] += count
 
     def _on_picture(self, payload: bytes | None) -> bytes:
-        if not self._picture:
+        if self._result is None:
             raise ValueError("no step has been made yet")
-        return self._picture
+        return encode(self._result.picture)
 
     # The loop
+
+    def _take(self, timeout: float) -> list[Arrival | Order]:
+        """What has come; where the service is behind, of each source the newest complete scan only."""
+        items = self._inbox.take(timeout)
+        self._taken = time.time_ns()
+        oldest = next((item.received for _, item in items if isinstance(item, Arrival)), self._taken)
+        if self._overload.look(time.monotonic(), (self._taken - oldest) / 1e9, self._times.skipped):
+            items, gone = overtaken(items, lambda item: item.data if isinstance(item, Arrival) else None)
+            for name, count in gone.items():
+                self._counts["overtaken"] += count
+                self._lasting.handle(Refused(name, "overtaken", count, dropped=True), self._taken)
+        return [item for _, item in items]
 
     def _receive(self, item: Arrival | Order) -> None:
         if isinstance(item, Order):
@@ -173,8 +196,8 @@ class Service:
             self._lasting.handle(Refused(name, "source"), item.received)
             return
         fault = ""
-        if self._message_clock is not None and isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)):
-            fault = self._message_clock.fault(message, item.received)
+        if isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)):
+            fault = self._times.fault(message, item.received)
         self._lasting.handle(Refused(name, fault) if fault else message, item.received)
 
     def _note_tokens(self) -> bool:
@@ -182,8 +205,7 @@ class Service:
         changed = self._tokens.changes()
         for name, alive in changed.items():
             self._lasting.handle(SourceFound(name) if alive else SourceLost(name), time.time_ns())
-            if self._message_clock is not None:
-                self._message_clock.presence(name, alive)
+            self._times.presence(name, alive)
         for name, alive in changed.items():
             if self._told.allows(f"tokens {self._counts['tokens'] % 20}", 1.0):  # twenty lines a second
                 log.info("source %s is %s", name, "there" if alive else "gone")
@@ -200,9 +222,11 @@ class Service:
 
     def _step_all(self, stop: threading.Event) -> None:
         while not stop.is_set():
-            due = self._wall_clock.due(time.time_ns()) if self._message_clock is None else self._message_clock.due()
+            due = self._times.due(self._taken, self._lasting.centre.time)
             if due is None:
                 return
+            if skipped := self._times.untold():
+                self._lasting.handle(Skipped(skipped), time.time_ns())
             if due <= self._lasting.centre.time:
                 self._lasting.handle(ClockSet(due), time.time_ns())
             if due > self._lasting.centre.time:
@@ -219,17 +243,18 @@ class Service:
     def _step(self, at: int) -> None:
         begin = time.perf_counter()
         made = self._lasting.step(at)
+        self._times.made(time.perf_counter() - begin)
         if made is None:
             return
+        for what, payload in made.messages.items():
+            self._out[what].put(payload)
+        self._status.published(at, time.time_ns())
         notes = made.result.status.notes
         if notes and self._told.allows(notes[0], 600.0):
             log.warning("%s", "; ".join(notes))
         self._tell_sources(made.result.log)
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
-        self._picture = made.messages["tracks"]
-        for what, payload in made.messages.items():
-            self._out[what].put(payload)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
 
     def _tell_sources(self, journal: StepLog) -> None:
@@ -255,7 +280,8 @@ class Service:
             inbox=self._inbox,
             refused=refused,
             alive=self._tokens.told,
-            skipped=self._wall_clock.skipped,
+            skipped=self._times.skipped,
+            overload=None if self._overload.since is None else time.monotonic() - self._overload.since,
         )
         self._out["status"].put(encode(status))
         return status

@@ -9,18 +9,21 @@ from collections.abc import Mapping
 from typing import Any
 
 from fusion_service.bus import Inbox
+from fusion_service.compiled import road
 from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
 
 __all__ = ["StatusMaker", "status_line"]
 
+SAME_CLOCK = 3600.0
+"""Seconds: pictures that are older when they go out are of a mission with a clock of its own."""
 NAMED = 5
 """Sources that a line names; of more it says the number."""
 
 
 class StatusMaker:
-    """counts: messages, bytes, steps, missed, failed_steps, unsaved, behind; whoever sees one counts it."""
+    """counts: messages, bytes, steps, missed, overtaken, failed_steps, unsaved, behind; whoever sees one counts it."""
 
     def __init__(self, name: str) -> None:
         self.counts: Counter[str] = Counter()
@@ -30,6 +33,7 @@ class StatusMaker:
         self._before_at = 0.0
         self._started = time.monotonic()
         self._seconds = {"last": 0.0, "max": 0.0, "total": 0.0}
+        self._latency: float | None = None
 
     def stepped(self, seconds: float) -> None:
         """A step was made, in so many seconds."""
@@ -37,6 +41,11 @@ class StatusMaker:
         self._seconds["last"] = seconds
         self._seconds["max"] = max(self._seconds["max"], seconds)
         self._seconds["total"] += seconds
+
+    def published(self, time: int, now: int) -> None:
+        """The picture of `time`, ns, went out at `now`. Nothing is said of missions played at another time."""
+        latency = (now - time) / 1e9
+        self._latency = latency if abs(latency) < SAME_CLOCK else None
 
     def make(
         self,
@@ -47,9 +56,10 @@ class StatusMaker:
         refused: dict[str, int],
         alive: Mapping[str, bool],
         skipped: int,
+        overload: float | None = None,
     ) -> Status:
         """The status now. last: the centre's own, of its newest step; refused: by reason; alive: whether each source is
-        there; skipped: steps that were slept through."""
+        there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not."""
         uptime = time.monotonic() - self._started
         counts, now = self.counts, time.time_ns()
         recent, span = counts - self._before, max(uptime - self._before_at, 1e-3)
@@ -68,7 +78,12 @@ class StatusMaker:
             step=last.step if last is not None else 0,
             uptime=uptime,
             rates={name: recent[name] / span for name in ("messages", "bytes", "steps")},
-            queue={**queue, **(last.queue if last is not None else {}), "missed": counts["missed"]},
+            queue={
+                **queue,
+                **(last.queue if last is not None else {}),
+                "missed": counts["missed"],
+                "overtaken": counts["overtaken"],
+            },
             refused=refused,
             dropped=last.dropped if last is not None else {},
             sources=sources,
@@ -81,9 +96,22 @@ class StatusMaker:
                 "unsaved": float(counts["unsaved"]),
                 "skipped": float(skipped),
                 "behind": float(counts["behind"]),
+                **({"latency": self._latency} if self._latency is not None else {}),
+                **({"overload": overload} if overload is not None else {}),
             },
+            road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
+            notes=self._notes(last, skipped, overload),
         )
+
+    def _notes(self, last: Status | None, skipped: int, overload: float | None) -> tuple[str, ...] | None:
+        """The centre's notes, after what the process has to say."""
+        said = last.notes if last is not None else None
+        if overload is None:
+            return said
+        behind = "" if self._latency is None else f", and the picture is {self._latency:.2f} s old when it goes out"
+        counts = f"{skipped} steps skipped and {self.counts['overtaken']} scans overtaken by newer ones since the start"
+        return (f"overload for {overload:.0f} s: more comes than can be worked off; {counts}{behind}", *(said or ()))
 
 
 def status_line(status: Status) -> str:
@@ -91,6 +119,10 @@ def status_line(status: Status) -> str:
     tracks = ", ".join(f"{count} {name}" for name, count in status.tracks.items()) or "no step yet"
     alive = sum(bool(said.get("alive")) and not said.get("stale") for said in status.sources.values())
     line = f"{tracks}; {alive} of {len(status.sources)} sources alive"
+    if "overload" in status.step_time:
+        line += (
+            f"; OVERLOAD: {status.step_time['skipped']:.0f} steps skipped, {status.queue['overtaken']} scans overtaken"
+        )
     doubted = {name: state for name, said in status.sources.items() if (state := state_of(said)) not in ("", "trusted")}
     if len(doubted) > NAMED:
         line = f"{line}; {len(doubted)} not trusted"

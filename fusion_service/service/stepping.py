@@ -1,4 +1,10 @@
-"""A centre that goes on whatever happens: it is made from its checkpoint, and made again from it should a step fail."""
+"""A centre that goes on whatever happens: it is made from its checkpoint, and made again from it should a step fail.
+
+What a step publishes waits for the disk only where a lost checkpoint would take back what was said of ids: a track was
+born, ended, merged or split, or something other than data came in (a source, an order, an era). Else the checkpoint is
+saved after publishing, `SAVED_EVERY` at most. So a service that is killed goes on with the same ids, from data that are
+a second old at most; new ids are of a generation of their own in any case (`state`).
+"""
 
 from __future__ import annotations
 
@@ -14,9 +20,12 @@ from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
-from schemas import encode
+from schemas import encode, messages
 
-__all__ = ["LastingCentre", "Made"]
+__all__ = ["SAVED_EVERY", "LastingCentre", "Made"]
+
+SAVED_EVERY = 1.0
+"""Seconds between checkpoints of steps that change no id."""
 
 log = logging.getLogger(__name__)
 
@@ -52,6 +61,8 @@ class LastingCentre:
         self._counts = counts
         self._restarted = restarted
         self._desk = desk
+        self._changed = False
+        self._saved_at = float("-inf")
         self._checkpoint = state.load()
         self._generation = state.new_generation()
         self.centre = self._make_centre()
@@ -73,7 +84,8 @@ class LastingCentre:
         self.centre.handle(event, received)
 
     def step(self, at: int) -> Made | None:
-        """Make the step at `at`, ns, and save it; None where it fails even without what came in for it."""
+        """Make the step at `at`, ns, saved if it must be before it is published; None where it fails even without what
+        came in for it. Call `save` when it has been."""
         try:
             made = self._make(at)
         except Exception:
@@ -82,22 +94,32 @@ class LastingCentre:
                 return None
             made = again
         self._desk.follow(self.centre)
+        return made
+
+    def save(self, *, at_once: bool = False) -> None:
+        """Save what has changed, where that is due."""
+        if self._changed and (at_once or time.monotonic() - self._saved_at >= SAVED_EVERY):
+            self._keep(self.centre.checkpoint())
+
+    def _keep(self, checkpoint: bytes) -> None:
+        self._checkpoint, self._changed, self._saved_at = checkpoint, False, time.monotonic()
         try:
-            self._state.save(self._checkpoint or b"")
+            self._state.save(checkpoint)
         except OSError as error:
             self._counts["unsaved"] += 1
             self._told.error("cannot save the checkpoint: %s", error)
-        return made
 
     def _make(self, at: int) -> Made:
         """Make a step, and all that it leaves behind, or raise with nothing left behind."""
         result = self.centre.step(at)
-        checkpoint = self.centre.checkpoint()
+        checkpoint = self.centre.checkpoint() if _settles(result) else None
         sent = time.time_ns()
         tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
-        messages = {"tracks": encode(tracks), "log": encode(journal)}
-        self._checkpoint = checkpoint
-        return Made(result, messages)
+        payloads = {"tracks": encode(tracks), "log": encode(journal)}
+        self._changed = True
+        if checkpoint is not None:
+            self._keep(checkpoint)
+        return Made(result, payloads)
 
     def _recover(self, at: int) -> Made | None:
         """A step failed, by a fault of ours: drop what came in since the last one, and make it from the last
@@ -124,3 +146,9 @@ class LastingCentre:
         self._restarted()
         for order in self._desk.again(self._checkpoint is None):
             self.centre.handle(order, time.time_ns())
+
+
+def _settles(result: StepResult) -> bool:
+    """Whether a step says something of ids, or obeys something, that a centre made anew must know."""
+    picture, log = result.tracks, result.log
+    return bool(picture.ended or picture.split_from or log.events or (log.decisions.kind == messages.BORN).any())

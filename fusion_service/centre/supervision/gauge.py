@@ -48,14 +48,25 @@ def gauge_weights(sigma: Floats, label: Ints, mean: Floats, variance: Floats) ->
     weight = np.ones(sigma.shape)
     for first in np.unique(label).tolist():
         mine = np.flatnonzero(label == first)
-        for parameter in KEPT:
-            some = mine[sigma[mine, parameter] > 0]
+        there = (sigma[mine] > 0)[:, KEPT]
+        every = np.array(KEPT)[there.all(axis=0)]
+        parts = [(mine, every)] if len(every) else []
+        parts += [
+            (mine[there[:, k]], np.array([KEPT[k]])) for k in np.flatnonzero(there.any(axis=0) & ~there.all(axis=0))
+        ]
+        for some, which in parts:
             if len(some) > 2:
-                off = mean[some, parameter] - np.median(mean[some, parameter])
-                usual = np.minimum(variance[some, parameter], np.median(variance[some, parameter]))
-                spread = usual + (FLOOR * sigma[some, parameter]) ** 2
-                weight[some, parameter] = spread / (spread + off**2)
+                at = np.ix_(some, which)
+                off = mean[at] - _median(mean[at])
+                spread = np.minimum(variance[at], _median(variance[at])) + (FLOOR * sigma[at]) ** 2
+                weight[at] = spread / (spread + off**2)
     return weight
+
+
+def _median(x: Floats) -> Floats:
+    """Of each column of x (K, M), which is finite."""
+    ordered = np.sort(x, axis=0)
+    return np.asarray(0.5 * (ordered[(len(x) - 1) // 2] + ordered[len(x) // 2]))
 
 
 def gauge(sigma: Floats, label: Ints, reference: Bools, weights: Floats) -> Floats:

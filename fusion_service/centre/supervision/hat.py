@@ -16,6 +16,7 @@ sources is then below 1, of .5 to .7 as a rule, and what is above 1 is no effect
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -76,10 +77,18 @@ class Factors:
 
 def decidable(pairs: Pairs, sources: int) -> Bools:
     """Of which sources (S,) the factor follows from the pairs."""
-    i, j, S = pairs.first, pairs.second, sources
+    return _decidable(pairs.first.astype(np.int64).tobytes(), pairs.second.astype(np.int64).tobytes(), sources)
+
+
+@lru_cache(maxsize=32)
+def _decidable(first: bytes, second: bytes, S: int) -> Bools:
+    """The same by the pairs alone, which are mostly those of the last look."""
+    i, j = np.frombuffer(first, np.int64), np.frombuffer(second, np.int64)
     cover = coo_array((np.ones(2 * len(i)), (np.concatenate([i, i + S]), np.concatenate([j + S, j]))), (2 * S, 2 * S))
     label = connected_components(cover, directed=False)[1]
-    return np.asarray(label[:S] == label[S:])
+    out = np.asarray(label[:S] == label[S:])
+    out.flags.writeable = False
+    return out
 
 
 def solved(pairs: Pairs, last: Floats) -> Factors:

@@ -85,12 +85,12 @@ def _candidates(one: Tracks2, other: Tracks2, site: Floats, sigma: Floats) -> tu
     reach = (
         (sigma[CLOCK] * speed) ** 2 + sigma[X] ** 2 + sigma[Y] ** 2 + (sigma[HEADING] * far) ** 2 + sigma[RANGE] ** 2
     )
-    away = other.place[:, None, :] - one.place[:, :, None]
     own = one.spread[0, 0] + one.spread[1, 1]
     its = other.spread[0, 0] + other.spread[1, 1]
-    limit = FAR_SIGMAS**2 * (reach + own)[:, None] + FAR_SIGMAS**2 * its
-    good = away[0] ** 2 + away[1] ** 2 <= limit
-    i, j = np.nonzero(good)
+    i, j = _in_strips(one.place, other.place, FAR_SIGMAS * np.sqrt(reach + own + its.max(initial=0.0)))
+    away = other.place[:, j] - one.place[:, i]
+    good = away[0] ** 2 + away[1] ** 2 <= FAR_SIGMAS**2 * (reach + own)[i] + FAR_SIGMAS**2 * its[j]
+    i, j = i[good], j[good]
     spread = one.speed_spread[:, :, i] + other.speed_spread[:, :, j]
     turn = sigma[HEADING] * speed[i]
     for k in (0, 1):
@@ -101,6 +101,21 @@ def _candidates(one: Tracks2, other: Tracks2, site: Floats, sigma: Floats) -> tu
         every = -(-len(i) // MOST_PAIRS)
         i, j = i[::every], j[::every]
     return i, j
+
+
+def _in_strips(one: Floats, other: Floats, reach: Floats) -> tuple[Ints, Ints]:
+    """Pairs (i, j), in order, of places (2, .) no farther apart than the `reach` of i along that axis on which the
+    others are spread most."""
+    spread = [float(np.ptp(axis)) if len(axis) else 0.0 for axis in other]
+    a, b = one[int(np.argmax(spread))], other[int(np.argmax(spread))]
+    order = np.argsort(b, kind="stable")
+    wide = reach * (1.0 + 1e-9)
+    first, last = np.searchsorted(b[order], a - wide, "left"), np.searchsorted(b[order], a + wide, "right")
+    number = np.maximum(last - first, 0)
+    i = np.repeat(np.arange(len(a)), number)
+    j = order[np.arange(len(i)) - np.repeat(np.cumsum(number) - number, number) + np.repeat(first, number)]
+    ordered = np.argsort(i * max(len(b), 1) + j, kind="stable")
+    return i[ordered], j[ordered]
 
 
 def _verify(

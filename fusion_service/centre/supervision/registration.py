@@ -29,7 +29,6 @@ from fusion_service.centre.supervision.correction import Bias
 from fusion_service.centre.supervision.estimate import Information, Posterior
 from fusion_service.centre.supervision.gauge import connected, gauge, gauge_weights, gauge_words, halved
 from fusion_service.centre.supervision.lasting import Lasting, robust
-from fusion_service.centre.supervision.shared import Shared
 from fusion_service.centre.supervision.unlinked import Unlinked
 from fusion_service.centre.treatment import Correction
 from schemas import Ecef, SensorInfo
@@ -80,9 +79,7 @@ class Registration:
         placed = {"x", "y"} <= set(config.space) and not isinstance(self._intake.frame, (Ecef, type(None)))
         return config.registration != "off" and placed
 
-    def observe(
-        self, rows: Rows, names: tuple[str, ...], now: Picture, shared: Shared, time: int, journal: Journal
-    ) -> None:
+    def observe(self, rows: Rows, names: tuple[str, ...], now: Picture, time: int, journal: Journal) -> None:
         """Learn from a step. now: the picture predicted to it, with its links decided."""
         if self._frame != self._intake.frame:
             self._begin()
@@ -189,7 +186,6 @@ class Registration:
         before = self._lasting.ratio
         self._lasting.learn(replace(group, weight=group.weight * factor), ids, updated, residual, certain)
         self._information.reweigh(before, self._lasting.ratio)
-        self._estimate(sites)  # of what is kept: a centre that starts from its checkpoint has no other
         v = part.velocity[:, group.group]
         what = (np.ones(len(part.row)), v[0], v[1], v[0] ** 2, v[0] * v[1], v[1] ** 2)
         self._seen = self._seen + np.stack(

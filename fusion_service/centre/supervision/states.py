@@ -32,6 +32,7 @@ FARTHEST = 1e8
 OVER = 1.2
 CALM = 10.0
 STEP = 1.25
+NONE = Opinion()
 NAMED = 4
 """Other sources that a reason names."""
 
@@ -70,7 +71,10 @@ class States:
         kept = {}
         for name in names:
             was = self.by_name.get(name, State(since=time))
-            opinion = opinions.get(name, Opinion())
+            opinion = opinions.get(name, NONE)
+            if was == State(since=was.since) and not any(opinion.wrong) and name not in conduct and name not in orders:
+                kept[name] = was
+                continue
             now = self._next(was, opinion, time)
             if name in conduct and self.acts:
                 now = replace(now, state="out", why=conduct[name])

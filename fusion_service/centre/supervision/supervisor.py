@@ -1,8 +1,13 @@
-"""`Supervisor`: watches the sources beside each other, and says how each is treated in the next step."""
+"""`Supervisor`: watches the sources beside each other, and says how each is treated in the next step.
+
+Who repeats itself or jumps is seen in every step. What sources say of each other is looked at once in `LOOK` seconds of
+data at most, with all that came in since, so that it costs the same however often a centre steps.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import astuple, replace
 from typing import Any
 
 import numpy as np
@@ -11,7 +16,7 @@ from fusion_service.arrays import Floats
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
-from fusion_service.centre.rows import Rows
+from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.supervision.comparing import labels
 from fusion_service.centre.supervision.conduct import Conduct
 from fusion_service.centre.supervision.honesty import Honesty, Innovations, Opinion
@@ -23,8 +28,10 @@ from fusion_service.centre.treatment import Treatment
 
 __all__ = ["Supervisor"]
 
+LOOK = 0.5
+"""Seconds between looks at least: what a filter says ten times a second tells hardly more than what it says twice."""
 PACE = 30.0
-"""Steps over which the time between them is averaged."""
+"""Looks over which the time between them is averaged."""
 
 
 class Supervisor:
@@ -39,7 +46,9 @@ class Supervisor:
         self.traffic = Traffic()
         self._honesty = Honesty(self._config.space)
         self._opinions: dict[str, Opinion] = {}
-        self._last, self._pace = -1, 0.0
+        self._last, self._pace, self._looks = -1, 0.0, 0
+        self._names: tuple[str, ...] = ()
+        self._told: dict[str, dict[str, Any]] = {}
         self._frame = intake.frame
 
     def observe(
@@ -58,26 +67,44 @@ class Supervisor:
         jumped = {name for name in names if self.conduct.jumped(name, time)}
         for name in sorted(jumped):
             self.registration.forget(name)
-        shared = shared_pairs(rows, step)
+        judges = self._config.supervision != "off"
+        if judges:
+            self.traffic.heard(names, self._intake)
+        if jumped or self._is_due(names, time):
+            self._look(_since(rows, self._last), names, now, time, journal, own or {}, jumped)
+        if judges:
+            for event in self.states.settle(names, self._opinions, self._orders(), self._stuck(names), time):
+                journal.event(event)
+        self._treat(names)
+
+    def _is_due(self, names: tuple[str, ...], time: int) -> bool:
+        """Whether it is time for a look; there is one at once when there is another source, or another frame."""
+        waits = 0 <= self._last <= time and time - self._last < LOOK * 1e9
+        return not waits or names != self._names or self._frame != self._intake.frame
+
+    def _look(
+        self, rows: Rows, names: tuple[str, ...], now: Picture, time: int, journal: Journal, own: Innovations,
+        jumped: set[str],
+    ) -> None:  # fmt: skip
+        """Compare the sources. What is fresh in the rows came in since the last look."""
+        shared = shared_pairs(rows, self._looks)
         before = [self.registration.told(name) for name in names]
-        self.registration.observe(rows, names, now, shared, time, journal)
+        self.registration.observe(rows, names, now, time, journal)
         if self._config.supervision != "off":
-            self.traffic.observe(rows, names, now, self._intake, time)
+            self.traffic.compare(rows, names, now, self._intake, time)
             if self._frame != self._intake.frame:
                 self._honesty.rebase()
-                self._frame = self._intake.frame
-            self._honesty.observe(rows, names, self._beside(rows, names, shared, step), self._applied(names))
-            self._opinions = self._honesty.opinions(self._chance(time), own or {})
+            self._honesty.observe(rows, names, self._beside(rows, names, shared), self._applied(names))
+            self._opinions = self._honesty.opinions(self._chance(time), own)
             for name in filter(self.registration.told_only, names):
                 opinion = self._opinions.get(name, Opinion())
                 self._opinions[name] = covering(opinion, self.registration.size(name))
-            for event in self.states.settle(names, self._opinions, self._orders(), self._stuck(names), time):
-                journal.event(event)
             if changed := self._otherwise(names, before) | dict.fromkeys(jumped, np.inf):
                 self._honesty.forget(changed)
-        self._treat(names)
+        self._frame, self._names, self._last, self._told = self._intake.frame, names, time, {}
+        self._looks += 1
 
-    def _beside(self, rows: Rows, names: tuple[str, ...], shared: Shared, step: int) -> Shared:
+    def _beside(self, rows: Rows, names: tuple[str, ...], shared: Shared) -> Shared:
         """The pairs that are compared: also those of targets that errors of clock and place are too large for any link
         of, where these are told only, or what is taken off does not mend it. Unsure of itself by that much, a source is
         linked and shows nothing twice."""
@@ -85,7 +112,7 @@ class Supervisor:
         if not same:
             return shared
         told_only = self._config.registration == "estimate"
-        wide = shared_pairs(rows, step, labels(rows, same))
+        wide = shared_pairs(rows, self._looks, labels(rows, same))
         tried = np.array([told_only or self.registration.told(name)[0] for name in names], dtype=np.bool_)[rows.source]
         link = rows.tracks.link
         kept = (link[wide.first] == link[wide.second]) | tried[wide.first] | tried[wide.second]
@@ -106,12 +133,11 @@ class Supervisor:
         return np.array(factors, dtype=np.float64).reshape(len(names), 2).T
 
     def _chance(self, time: int) -> float:
-        """Of a false alarm about a source, at one look, of which there is one in every step."""
+        """Of a false alarm about a source, at one look."""
         if 0 <= self._last < time:
             seconds = (time - self._last) / 1e9
             self._pace += (seconds - self._pace) / PACE if self._pace > 0 else seconds
-        self._last = time
-        return self._config.supervision_errors * (self._pace or self._config.period) / 3600.0
+        return self._config.supervision_errors * (self._pace or max(self._config.period, LOOK)) / 3600.0
 
     def _stuck(self, names: tuple[str, ...]) -> dict[str, str]:
         """Whose tracks stand still to the bit, and the sentence that says so."""
@@ -134,7 +160,9 @@ class Supervisor:
 
     def health(self, name: str) -> dict[str, Any]:
         """What the status says of a source."""
-        told = self.registration.health(name) | self.conduct.health(name)
+        if name not in self._told:
+            self._told[name] = self.registration.health(name)
+        told = self._told[name] | self.conduct.health(name)
         if self._config.supervision == "off":
             return told
         state, opinion = self.states.of(name), self._opinions.get(name)
@@ -160,11 +188,13 @@ class Supervisor:
 
     def packed(self) -> dict[str, Any]:
         """As plain values."""
-        packed = {"registration": self.registration.packed(), "conduct": self.conduct.packed()}
+        packed: dict[str, Any] = {"registration": self.registration.packed(), "conduct": self.conduct.packed()}
+        packed["look"] = [self._last, self._looks, list(self._names), repr(self._frame)]
         if self._config.supervision == "off":
             return packed
-        pace = [self._last, self._pace, repr(self._intake.frame)]
+        pace = [self._last, self._pace, repr(self._frame)]
         return packed | {
+            "opinions": {name: astuple(one) for name, one in sorted(self._opinions.items())},
             "honesty": self._honesty.packed(),
             "states": self.states.packed(),
             "pace": pace,
@@ -175,12 +205,28 @@ class Supervisor:
         """From what `packed` gave."""
         self.registration.restore(packed.get("registration", {}))
         self.conduct.restore(packed.get("conduct", {}))
+        self._frame = self._intake.frame
+        if "look" in packed:
+            self._last, self._looks, names, _ = packed["look"]
+            self._names = tuple(names)
         if "honesty" in packed and self._config.supervision != "off":
             self._honesty.restore(packed["honesty"])
             self.states.restore(packed["states"])
             self.traffic.restore(packed["traffic"])
+            self._opinions = {str(name): _opinion(one) for name, one in packed.get("opinions", {}).items()}
             self._last, self._pace, frame = packed["pace"]
-            self._frame = self._intake.frame
             if frame != repr(self._frame):
                 self._honesty.rebase()
         self._treat(self._intake.names())
+
+
+def _since(rows: Rows, last: int) -> Rows:
+    """The rows, fresh where a measurement was judged in them after the step at `last`, ns."""
+    new = rows.fresh | ((rows.tracks.link != NO_TRACK) & (rows.tracks.seen > last))
+    return rows if np.array_equal(new, rows.fresh) else replace(rows, fresh=new)
+
+
+def _opinion(packed: list[Any]) -> Opinion:
+    """From what `astuple` gave, lists for tuples."""
+    values: list[Any] = [tuple(one) if isinstance(one, (list, tuple)) else one for one in packed]
+    return Opinion(*values)

@@ -46,11 +46,11 @@ def observable(told: Told) -> Bools:
 
 def entry(told: Told) -> dict[str, dict[str, Any]]:
     """Each error that is estimated: value, sigma, whether it is observable, and if not, why."""
-    seen = observable(told)
+    seen, spread = observable(told), told.spread
     return {
         name: {
             "value": float(told.mean[k]),
-            "sigma": float(told.spread[k]),
+            "sigma": float(spread[k]),
             "observable": bool(seen[k]),
             "why": "" if seen[k] else _why(told, k),
         }
@@ -86,9 +86,10 @@ def _why(told: Told, parameter: int) -> str:
 def numbers(told: Told) -> dict[str, float]:
     """For an event."""
     out: dict[str, float] = {}
+    spread = told.spread
     for k, name in enumerate(PARAMETERS):
         if told.sigma[k] > 0:
-            out |= {name: round(float(told.mean[k]), 6), f"{name}_sigma": round(float(told.spread[k]), 6)}
+            out |= {name: round(float(told.mean[k]), 6), f"{name}_sigma": round(float(spread[k]), 6)}
     return out
 
 
@@ -98,10 +99,11 @@ def note(told: Told, applied: bool, found: bool, corrects: bool) -> str:
         return "no common targets: nothing is known of its clock and place" if told.sigma.any() else ""
     if not found:
         return "no error of clock or place that is certain and matters"
+    spread = told.spread
     parts = [
-        _worded(name, float(told.mean[k]), float(told.spread[k]), unit)
+        _worded(name, float(told.mean[k]), float(spread[k]), unit)
         for k, (name, unit) in enumerate(zip(PARAMETERS, UNITS, strict=True))
-        if told.sigma[k] > 0 and abs(told.mean[k]) > 2.0 * told.spread[k]
+        if told.sigma[k] > 0 and abs(told.mean[k]) > 2.0 * spread[k]
     ]
     done = "taken off" if applied else "not taken off yet" if corrects else "told only (registration = estimate)"
     return f"{', '.join(parts) or 'errors that are certain only together'}: {done}"

@@ -92,19 +92,25 @@ class Traffic:
 
     by_name: dict[str, Record] = field(default_factory=dict)
 
-    def observe(self, rows: Rows, names: tuple[str, ...], now: Picture, intake: Intake, time: int) -> None:
-        """Learn from a step at `time`, ns, its links decided. now: the picture predicted to it."""
+    def heard(self, names: tuple[str, ...], intake: Intake) -> None:
+        """Learn of the messages of a step."""
         self.by_name = {name: self.by_name.get(name, Record()) for name in names}
         for name, record in self.by_name.items():
             for stamp, received in intake.sources[name].came:
                 record.came(stamp, received)
+
+    def compare(self, rows: Rows, names: tuple[str, ...], now: Picture, intake: Intake, time: int) -> None:
+        """Learn of the targets of the sources that have something new, at `time`, ns, links decided. now: the picture
+        predicted to it."""
         if intake.frame is None or not len(now.id):
+            return
+        covered, knows = self._covered(names, now, intake, time)
+        if not knows.any():
             return
         linked = rows.tracks.link != NO_TRACK
         at = now.find(rows.tracks.link[linked])
         has = np.zeros((len(names), len(now.id)), dtype=np.bool_)
         has[rows.source[linked], at] = True
-        covered, knows = self._covered(names, now, intake, time)
         should = covered.sum(axis=0)
         count = has.sum(axis=0)
         scanned = np.bincount(rows.source[rows.fresh], minlength=len(names)) > 0

@@ -1,6 +1,7 @@
 """Global tracks that are the same target though nothing links them, since the errors of their sources are too large.
 
-In each step one pair of sources that should share targets and hardly do is looked at (`matching`), pair after pair.
+In each look one pair of sources that should share targets and hardly do is looked at (`matching`), pair after pair; not
+one that others tie together, with each of which the next shares targets: their errors are estimated by those.
 What is found several times is believed: the errors of both are estimated as if the tracks were linked. It is believed
 no more when it is looked for and not found, or not looked for in a while.
 """
@@ -13,22 +14,25 @@ import numpy as np
 
 from fusion_service.arrays import Floats, Ints
 from fusion_service.centre.rows import NO_TRACK, Rows
+from fusion_service.centre.supervision.gauge import connected
 from fusion_service.centre.supervision.matching import FEWEST, Tracks2, match
 
 __all__ = ["Unlinked"]
 
 BELIEVED, MOST_VOTES = 3, 5
 EXPIRES = 120
-"""Steps in which a pair was not looked for."""
+"""Looks in which a pair was not looked for."""
 MOST_PAIRS = 2000
 MOST_COMPARED = 1_000_000
 """Tracks of one source times those of the other: of more, every so many of the one, in turns."""
+TIED = 0.25
+"""Of the tracks of that source that has fewer: more links than that tie the two."""
 FEW_LINKS = 0.5
 """Of the tracks of that source that has fewer: more links than that are enough."""
 
 
 class Unlinked:
-    """votes: {(older, younger global track): (how often found, less how often not, step of the last look)}."""
+    """votes: {(older, younger global track): (how often found, less how often not, number of the last look)}."""
 
     def __init__(self) -> None:
         self.votes: dict[tuple[int, int], tuple[int, int]] = {}
@@ -120,7 +124,9 @@ def _lonely(rows: Rows, whose: Ints) -> list[tuple[int, int]]:
     there[target, place[rows.source[linked]]] = ~rows.tracks.outside[linked]
     shared = there.T @ there
     fewer = np.minimum(count[some][:, None], count[some])
-    first, second = np.nonzero(np.triu(shared < FEW_LINKS * fewer, 1))
+    tied = connected(np.where(shared >= np.maximum(TIED * fewer, FEWEST), 1.0, 0.0))
+    apart = tied[:, None] != tied
+    first, second = np.nonzero(np.triu((shared < FEW_LINKS * fewer) & apart, 1))
     return list(zip(some[first].tolist(), some[second].tolist(), strict=True))
 
 

@@ -28,6 +28,7 @@ from schemas import (
     Status,
     StepLog,
     Truth,
+    Wholes,
     check_numbers,
 )
 
@@ -72,6 +73,7 @@ class Scene:
         self._charts = Charts(columns, focus)
         self._sources = SourceCharts(columns)
         self._matcher = TruthMatcher(cutoff)
+        self._wholes = Wholes()
         self._by_centre = False
         self._new: list[tuple[Message, Stamp]] = []
         self._said: set[tuple[str, str]] = set()
@@ -190,7 +192,12 @@ class Scene:
             drawing.truth(message, stamp)
         elif isinstance(message, GlobalTracks):
             event_log.tracks(message, stamp)
-            if self._assessable(message, stamp):
+            whole = self._wholes.of(message)
+            if whole is None:
+                return
+            if message.delta:
+                message, sound = whole, check_numbers([whole])[0] == 0
+            elif self._assessable(message, stamp):
                 self._matcher.step(message, stamp)
             if drawing.chart is not None:
                 self._too_many(message, "components", drawing.global_tracks(message, sound, stamp), stamp)

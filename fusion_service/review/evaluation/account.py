@@ -46,13 +46,15 @@ class Account:
     sources: SourceRecords = field(default_factory=SourceRecords)
 
     def picture(self, message: GlobalTracks) -> None:
-        """Enter a picture."""
+        """Enter a picture; of one that is a delta, not what it shows of the tracks that changed."""
         self.rules[message.rule] += 1
         self.pictures += 1
         self.dimension = len(message.space)
         self.runs.add(message.epoch)
-        self.shown.update(message.contributor_counts[message.status == CONFIRMED].tolist())
         self.ended.update(reason for _, reason, _ in message.ended)
+        if message.delta:
+            return
+        self.shown.update(message.contributor_counts[message.status == CONFIRMED].tolist())
         names, which = fused_by(message)
         fed = (message.status == CONFIRMED) & (message.contributor_counts > 0)
         self.ways.update(dict(zip(names, np.bincount(which[fed], minlength=len(names)).tolist(), strict=True)))

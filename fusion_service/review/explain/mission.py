@@ -20,7 +20,7 @@ from fusion_service.recording.survey import RecordedCentre, key_of, survey
 from fusion_service.review.explain.fused_by import FusedBy
 from fusion_service.review.explain.histories import TrackHistories
 from fusion_service.review.explain.story import Story
-from schemas import GlobalTracks, MessageError, StepLog, decode
+from schemas import GlobalTracks, MessageError, StepLog, Wholes, decode
 
 __all__ = ["RecordedMission", "Refusals", "read_mission"]
 
@@ -127,6 +127,7 @@ class _Reader:
         self._at = at
         self._until: int | None = None
         self._steps = Steps()
+        self._whole = Wholes()
         self._recent: dict[str, deque[RawMessage]] = {}
         self._runs: dict[tuple[str, str], Refusals] = {}
 
@@ -157,6 +158,8 @@ class _Reader:
 
     def _step(self, step: Step) -> None:
         mission = self._mission
+        if step.picture is not None:
+            step.picture = self._whole.of(step.picture)
         if not mission.steps:
             mission.start = step.time
             self._until = None if self._at is None else time_of(self._at, step.time)

@@ -1,10 +1,12 @@
-"""A recorded mission fused again by the clock of its messages: each as it came, stepped by `MessageClock`."""
+"""A recorded mission fused again by the clock of its messages: each as it came, stepped by `MessageClock`, or on
+arrival by `ArrivalClock`."""
 
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 
-from fusion_service.centre import MessageClock, Refused, source_of
+from fusion_service.centre import ArrivalClock, MessageClock, Refused, source_of
 from fusion_service.config import CentreConfig
 from fusion_service.recording.steps import Step
 from fusion_service.review.replay.engine import OnStep
@@ -26,7 +28,7 @@ class ClockEngine:
     def __init__(self, players: list[Player], configs: list[CentreConfig], on_step: OnStep) -> None:
         self._players = players
         self._configs = configs
-        self._clocks = [MessageClock(config) for config in configs]
+        self._clocks = [_clock(config) for config in configs]
         self._on_step = on_step
         self._names: set[str] = set()
         self._remarks: Counter[str] = Counter()
@@ -62,13 +64,25 @@ class ClockEngine:
         told = [f"{text} ({count} times)" for text, count in self._remarks.items()]
         return [*told, *filter(None, map(_refusals, self._players))]
 
-    def _step_all(self, player: Player, clock: MessageClock, received: int) -> None:
-        while (due := clock.due()) is not None:
+    def _step_all(self, player: Player, clock: MessageClock | ArrivalClock, received: int) -> None:
+        while player.centre is not None and (due := _due(clock, received, player.centre.time)) is not None:
             result = player.step((), (), due)
             if isinstance(result, str):
                 self._remarks[f"{player.variant.name}: a step cannot be made ({result})"] += 1
             else:
                 self._on_step(player, result, Step(result.tracks.epoch, result.tracks.step, received))
+
+
+def _clock(config: CentreConfig) -> MessageClock | ArrivalClock:
+    """No wall clock goes on here: what arrives is stepped by its own time."""
+    if config.trigger == "arrival":
+        return ArrivalClock(replace(config, clock="message"))
+    return MessageClock(config)
+
+
+def _due(clock: MessageClock | ArrivalClock, now: int, last: int) -> int | None:
+    due = clock.due() if isinstance(clock, MessageClock) else clock.due(now, last)
+    return None if due is not None and due <= last and isinstance(clock, ArrivalClock) else due
 
 
 def _refusals(player: Player) -> str:

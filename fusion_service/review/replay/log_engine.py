@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_service.centre import Event, NewEra, SourceFound, SourceLost, order_of
+from fusion_service.centre import Event, NewEra, Refused, SourceFound, SourceLost, order_of
 from fusion_service.config import config_hash
 from fusion_service.recording.steps import PATIENCE, Step, Steps
 from fusion_service.review.replay.engine import OnStep
@@ -197,8 +197,8 @@ class LogEngine:
 
 
 def _events(log: StepLog) -> list[Event]:
-    """What the log says came in beside messages."""
-    events: list[Event] = []
+    """What the log says came in beside messages, or was lost before it came in."""
+    events: list[Event] = [Refused(one.source, one.reason, one.count, dropped=True) for one in log.dropped]
     for event in log.events:
         kind, source = event.get("kind"), event.get("source")
         if kind in ("found", "lost") and isinstance(source, str):

@@ -94,7 +94,7 @@ class Verdict:
 
 
 _LABELS = ("identity", "identity_p", "kind", "kind_p", "track_origin", "marks", "number", "callsign")
-_HEADER = ("time", "rule", "space", "frame", "source", "epoch", "seq", "step", "origin", "lineage", "sources")
+_HEADER = ("time", "rule", "space", "frame", "source", "epoch", "seq", "step", "origin", "lineage", "sources", "delta")
 
 
 def _pictures(old: GlobalTracks, new: GlobalTracks) -> Iterator[Difference]:

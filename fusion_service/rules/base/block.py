@@ -1,7 +1,7 @@
 """What every rule works on and gives back: one block of fusions, batch-last, factorised once."""
 
-from dataclasses import dataclass
-from typing import Self
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 
@@ -23,9 +23,10 @@ class Sources:
     dets: Floats  # (N, B), of the covariances
     condition: Floats  # (B,), see `condition`
     definite: Bools  # (B,), every covariance is positive definite and of condition < 1e14
+    start: Floats | None = None  # (N, B), weights that may do, NaN where there are none: see `ci.from_start`
 
     @classmethod
-    def of(cls, means: Floats, covariances: Floats) -> Self:
+    def of(cls, means: Floats, covariances: Floats, start: Floats | None = None) -> Self:
         """From the layout of `fuse_last`: means (N, n, B), covariances (N, n, n, B)."""
         P = covariances.transpose(1, 2, 0, 3)
         A, dets, least = linalg.inverse_det(P)
@@ -34,7 +35,17 @@ class Sources:
         if not definite.all():
             P = np.where(definite, P, np.nan)  # stops every iteration at once
             A = np.where(definite, A, np.nan)
-        return cls(means.transpose(1, 0, 2), P, A, dets, worst, definite)
+        return cls(means.transpose(1, 0, 2), P, A, dets, worst, definite, start)
+
+    def take(self, some: Any) -> Self:
+        """Some elements of the batch (a mask or indices)."""
+        columns: list[Any] = [getattr(self, one.name) for one in fields(self)]
+        taken: list[Any] = [None if column is None else column[..., some] for column in columns]
+        return type(self)(*taken)
+
+    def without_start(self) -> Self:
+        """The same, to be weighed anew."""
+        return replace(self, start=None)
 
     @property
     def count(self) -> int:
@@ -67,6 +78,13 @@ class Result:
     influence: Floats | None  # (N, B)
     condition: Floats  # (B,): rounding errors of the inputs, as they reach the result
     gap: Floats  # (B,): of the weights, 0 where they are not optimised
+
+    def overwrite(self, at: Any, other: "Result") -> None:
+        """Put what `other` has in the place of the elements `at`."""
+        for one in fields(self):
+            mine = getattr(self, one.name)
+            if mine is not None:
+                mine[..., at] = getattr(other, one.name)
 
 
 def alone(sources: Sources, influence: bool) -> Result:

@@ -143,4 +143,5 @@ def _direction(H: Floats, residual: Floats) -> Floats:
     """Newton's step within sum(dw) = 0."""
     a = linalg.solve(H, residual)
     b = linalg.solve(H, np.ones_like(residual))
-    return (total(a) / total(b)) * b - a
+    out: Floats = (total(a) / total(b)) * b - a
+    return out

@@ -1,0 +1,130 @@
+"""The functions of `fusion_service.linalg` by kernels: same arguments, same results, bit for bit.
+
+None for what is not for a kernel: longdouble, an empty batch, batches that would have to be broadcast.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from fusion_service.compiled.either import Floats
+
+__all__ = ["functions"]
+
+F8 = np.dtype(np.float64)
+MANY = 2048
+"""Elements from which on NumPy is as fast at what is a few passes over the data."""
+
+
+def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
+    """By name, over these `kernels` (those of the module, compiled or as they are)."""
+    return {**_inverses(kernels), **_factors(kernels), **_products(kernels)}
+
+
+def _fits(a: Floats, *others: Floats) -> bool:
+    return a.dtype == F8 and a.size > 0 and all(one.dtype == F8 for one in others)
+
+
+def _flat(a: Floats, core: int) -> Floats:
+    return a if a.ndim == core + 1 else a.reshape(*a.shape[:core], -1)
+
+
+def _inverses(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
+    def inverted(P: Floats) -> tuple[Floats, Floats, Floats, Floats] | None:
+        if not _fits(P):
+            return None
+        batch = P.shape[2:]
+        p = _flat(P, 2)
+        out, rest = np.empty(p.shape), np.empty((3, p.shape[2]))
+        kernels.invert(p, out, rest[0], rest[1], rest[2])
+        return out.reshape(P.shape), rest[0].reshape(batch), rest[1].reshape(batch), rest[2].reshape(batch)
+
+    def inverse(P: Floats) -> Floats | None:
+        found = inverted(P)
+        return None if found is None else found[0]
+
+    def sweep(P: Floats) -> tuple[Floats, Floats, Floats] | None:
+        found = inverted(P)
+        return None if found is None else found[:3]
+
+    def inverse_det(P: Floats) -> tuple[Floats, Floats, Floats] | None:
+        found = inverted(P)
+        return None if found is None else (found[0], found[1], found[3])
+
+    return {"inverse": inverse, "sweep": sweep, "inverse_det": inverse_det}
+
+
+def _factors(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
+    def pivots(P: Floats) -> Floats | None:
+        if not _fits(P):
+            return None
+        d = np.empty((len(P), P[0, 0].size))
+        kernels.pivots(_flat(P, 2), d)
+        return d.reshape(P.shape[1:])
+
+    def ldl(P: Floats) -> tuple[Floats, Floats] | None:
+        if not _fits(P) or P[0, 0].size > MANY:
+            return None
+        p = _flat(P, 2)
+        L, d = np.empty(p.shape), np.empty(p.shape[1:])
+        kernels.ldl(p, L, d)
+        return L.reshape(P.shape), d.reshape(P.shape[1:])
+
+    def solved(P: Floats, x: Floats, back: bool) -> Floats | None:
+        if not _fits(P, x) or P.shape[1:] != x.shape:
+            return None
+        p, y = _flat(P, 2), _flat(x, 1)
+        solution, square = np.empty(y.shape if back else (1, 1)), np.empty(1 if back else y.shape[1])
+        kernels.solve(p, y, solution, square, back)
+        return solution.reshape(x.shape) if back else square.reshape(x.shape[1:])
+
+    return {
+        "_pivots": pivots,
+        "ldl": ldl,
+        "solve": lambda P, x: solved(P, x, True),
+        "quadratic": lambda P, x: solved(P, x, False),
+    }
+
+
+def _products(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
+    def matvec(A: Floats, x: Floats) -> Floats | None:
+        if not _fits(A, x) or A.shape[1:] != x.shape or x[0].size > MANY:
+            return None
+        out = np.empty((len(A), x[0].size))
+        kernels.matvec(_flat(A, 2), _flat(x, 1), out)
+        return out.reshape(len(A), *x.shape[1:])
+
+    def product(A: Floats, B: Floats) -> Floats | None:
+        if not _fits(A, B) or A.shape[1] != B.shape[0] or A.shape[2:] != B.shape[2:] or A.ndim < 3:
+            return None
+        shape = len(A), *B.shape[1:]
+        out = np.empty((*shape[:2], B[0, 0].size))
+        kernels.product(_flat(A, 2), _flat(B, 2), out)
+        return out.reshape(shape)
+
+    def inner(A: Floats, B: Floats) -> Floats | None:
+        if not _fits(A, B) or A.shape != B.shape or A.ndim < 3 or A[0, 0].size > MANY:
+            return None
+        out = np.empty(A[0, 0].size)
+        kernels.inner(_flat(A, 2), _flat(B, 2), out)
+        return out.reshape(A.shape[2:])
+
+    def congruence(F: Floats, P: Floats) -> Floats | None:
+        shared = F.ndim == 2
+        if not _fits(P, F) or F.shape[1] != len(P) or P.ndim < 3 or P[0, 0].size > MANY:
+            return None
+        if not (shared or F.shape[2:] == P.shape[2:]):
+            return None
+        m, p = len(F), _flat(P, 2)
+        out = np.empty((m, m, p.shape[2]))
+        if shared:
+            kernels.congruence(F, p, out)
+        else:
+            kernels.congruence_each(_flat(F, 2), p, out)
+        return out.reshape(m, m, *P.shape[2:])
+
+    return {"matvec": matvec, "product": product, "inner": inner, "congruence": congruence}
