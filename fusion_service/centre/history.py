@@ -23,6 +23,7 @@ from fusion_service.centre.intake import MAX_ORDERS, MAX_SOURCES, Intake
 from fusion_service.centre.pictures import source_of
 from fusion_service.centre.refusing import would_refuse
 from fusion_service.centre.scans import size_of
+from fusion_service.centre.spared import Spared
 from fusion_service.config import CentreConfig
 from fusion_service.order import Order
 from schemas import Entry, GlobalTracks, LocalIntensity, LocalTracks, Message, MessageError, Status, digest
@@ -59,12 +60,14 @@ class Late:
 @dataclass(slots=True, eq=False)
 class Past:
     """A step that was made: its time and that of the one before it, ns; events and messages that went into it, with
-    when they came; state: the checkpoint before it, lasting: as one of the few that are kept for long."""
+    when they came; spared: whose silence said nothing before it; state: the checkpoint before it, lasting: as one of
+    the few that are kept for long."""
 
     number: int
     time: int
     before: int
     events: tuple[tuple[Event, int], ...]
+    spared: Spared
     inputs: list[tuple[Message, int]] = field(default_factory=list)
     state: bytes | None = None
     lasting: bool = False

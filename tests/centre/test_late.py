@@ -110,8 +110,8 @@ def rows(picture: GlobalTracks) -> list[bytes]:
 
 
 def check_ids(pictures: Sequence[GlobalTracks], logs: Sequence[schemas.StepLog], scans: Sequence[Scan]) -> None:
-    """Births go up, ids in a picture once, and what has ended is back only where it says so; an id stays with its
-    target, which is that of the local tracks in it."""
+    """Births go up, ids in a picture once, and what has ended never returns; an id stays with its target, which is that
+    of the local tracks in it."""
     newest, over, whose = 0, set[int](), dict[int, set[int]]()
     for picture, log in zip(pictures, logs, strict=True):
         ids = picture.ids.tolist()
@@ -121,8 +121,6 @@ def check_ids(pictures: Sequence[GlobalTracks], logs: Sequence[schemas.StepLog],
         assert born == sorted(set(born))
         newest = max([newest, *born])
         assert max(ids, default=0) <= newest
-        for event in log.events:
-            over -= set(event.get("back", ()))
         over |= {old for old, _, _ in picture.ended}
         assert not over & set(ids)
         owner = np.repeat(picture.ids, picture.contributor_counts)
@@ -278,3 +276,21 @@ def test_a_flood_of_late_messages_costs_one_run_a_step_and_what_is_kept_is_bound
     messages = [message for past in kept.past for message, _ in past.inputs]
     assert sum(len(message.means) for message in messages if isinstance(message, LocalTracks)) <= 120
     assert len(late[-1].ids) >= TARGETS
+
+
+def test_an_id_that_has_ended_never_returns() -> None:
+    """Silence ends all tracks; then what was sent in the meantime comes, and more."""
+    seed = 6
+    print("seed", seed)
+    scans = [one for one in world(seed) if one.source == "r0"]
+    config = {**QUICK, "coast": 0.5, "coast_periods": 0.0, "lateness": 5.0, "source_defaults": {"stale": 0.6}}
+    arrivals = [
+        (at if k < 3 or k >= 9 else PERIOD * (9 + (k % 4)), data) for k, (at, data) in enumerate(ordered(scans))
+    ]
+    arrivals.sort(key=lambda one: one[0])
+    _, said, _ = fly(ordered(scans), config)
+    _, late, logs = fly(arrivals, config)
+    assert any(reason == "lost" for one in late for _, reason, _ in one.ended)
+    assert any("back" in event for log in logs for event in log.events)
+    assert rows(late[-1]) == rows(said[-1])
+    check_ids(late, logs, scans)

@@ -44,8 +44,6 @@ def check_sound(mission: Mission) -> None:
         assert all(one > newest for one in born)
         newest = max([newest, *born])
         assert all(one <= newest for one in ids)
-        for event in log.events:  # a target that had ended may have been there after all
-            over -= set(event.get("back", []) if event["kind"] == "revised" else [])
         ended = [old for old, _, _ in picture.ended]
         assert len(ended) == len(set(ended))
         over |= set(ended)
