@@ -41,11 +41,14 @@ def world(seed: int, *, parts: int = 1, intensity: bool = False) -> list[Scan]:
             header: dict[str, Any] = {"source": f"r{number}", "epoch": 1, "seq": k, "sent": START + round(t * SECOND)}
             where: dict[str, Any] = {"time": header["sent"], "space": SPACE, "frame": FRAME}
             means = np.repeat(mean, parts, axis=0) + np.tile(np.arange(parts), len(mean))[:, None]
-            density = {"means": means, "covariances": np.tile(covariance, (len(means), 1, 1))}
+            density: dict[str, Any] = {"means": means, "covariances": np.tile(covariance, (len(means), 1, 1))}
             if intensity:
                 found.append(LocalIntensity(**header, **where, **density, weights=np.full(len(means), 1.0 / parts)))
                 continue
-            mixed = {"counts": np.full(len(mean), parts, np.uint16), "weights": np.full(len(means), 1.0 / parts)}
+            mixed: dict[str, Any] = {
+                "counts": np.full(len(mean), parts, np.uint16),
+                "weights": np.full(len(means), 1.0 / parts),
+            }
             found.append(
                 LocalTracks(
                     **header, **where, **density, **(mixed if parts > 1 else {}), complete=True, ids=ids + 100 * number
