@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import schemas
-from fusion_service.centre import ArrivalClock, FusionCentre, Order, Refused
+from fusion_service.centre import ArrivalClock, FusionCentre, Order, Refused, Skipped
 from fusion_service.centre.arrival import TICK
 from fusion_service.config import CentreConfig, centre_config
 from fusion_service.review.replay import run_replay
@@ -160,7 +160,8 @@ def fly(seed: int, **config: Any) -> Flight:
                     Order("identify", track=int(flight.steps[-1].picture.ids[0]), identity="x:1"), START
                 )
             if (number, k) == (5, 0):
-                flight.centre.handle(Refused("r2", "queue", 2, dropped=True), START)
+                flight.centre.handle(Refused("r2", "overtaken", 2, dropped=True), START)
+                flight.centre.handle(Skipped(3), START)
             flight.step(at)
     return flight
 
