@@ -53,7 +53,7 @@ class Unknown:
     @classmethod
     def of(cls, space: tuple[str, ...], speed: float = 100.0, acceleration: float = 20.0) -> Unknown:
         """speed, acceleration: one sigma of what targets may have, m/s, m/s2."""
-        return _unknown(space, speed, acceleration)
+        return _unknown(tuple(space), speed, acceleration)
 
     def known(self, covariance: Floats) -> NDArray[np.bool_]:
         """Which components (n, ...) of densities with `covariance` (n, n, ...) are known."""
