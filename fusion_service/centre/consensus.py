@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Floats, Ints, picked
 from fusion_service.centre.association import SOUND as SOUND_ALONE
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.compiled.either import FAST
@@ -44,30 +44,37 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
     n, count = means.shape
     unique = np.unique(labels)
     mean, covariance = np.empty((n, len(unique))), np.empty((n, n, len(unique)))
-    others_mean, others_covariance = np.full((n, count), np.nan), np.full((n, n, count), np.nan)
+    partner = np.full(count, -1)
     size = np.ones(count, dtype=np.intp)
+    more: list[tuple[Ints, Floats, Floats]] = []
+    others = np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
     for names, rows in by_size(labels):
         at = np.searchsorted(unique, names)
         k = rows.shape[1]
         size[rows] = k
         if k == 1:
-            mean[:, at], covariance[:, :, at] = means[:, rows[:, 0]], covariances[:, :, rows[:, 0]]
+            mean[:, at], covariance[:, :, at] = picked(means, rows[:, 0]), picked(covariances, rows[:, 0])
             continue
         if "intersect" in FAST:
-            mean[:, at], covariance[:, :, at] = _compiled(rows, means, covariances, others_mean, others_covariance)
+            mean[:, at], covariance[:, :, at] = _compiled(rows, means, covariances, *others)
             continue
         columns = [rows[:, j] for j in range(k)]
-        xs, Ps = [means[:, one] for one in columns], [covariances[:, :, one] for one in columns]
+        xs, Ps = [picked(means, one) for one in columns], [picked(covariances, one) for one in columns]
         if k == 2:
             mean[:, at], covariance[:, :, at] = uniform_ci(np.stack(xs), np.stack(Ps))
-            for here, there in ((0, 1), (1, 0)):
-                others_mean[:, columns[here]], others_covariance[:, :, columns[here]] = xs[there], Ps[there]
+            partner[columns[0]], partner[columns[1]] = columns[1], columns[0]
             continue
         whole, without = _all_but_one(xs, Ps)
         mean[:, at], covariance[:, :, at] = whole
-        for one, (x, P) in zip(columns, without, strict=True):
-            others_mean[:, one], others_covariance[:, :, one] = x, P
-    return Consensus(unique, mean, covariance, others_mean, others_covariance, size)
+        more += [(one, *other) for one, other in zip(columns, without, strict=True)]
+    paired = np.flatnonzero(partner >= 0)
+    if len(paired) == count:
+        others = picked(means, partner), picked(covariances, partner)
+    elif len(paired):
+        others[0][:, paired], others[1][:, :, paired] = means[:, partner[paired]], covariances[:, :, partner[paired]]
+    for one, x, P in more:
+        others[0][:, one], others[1][:, :, one] = x, P
+    return Consensus(unique, mean, covariance, *others, size)
 
 
 def _compiled(
