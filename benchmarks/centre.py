@@ -31,6 +31,7 @@ from fusion_service.centre.linking import Linker
 from fusion_service.centre.memory import Memory
 from fusion_service.centre.motions import Motions
 from fusion_service.centre.supervision import Supervisor
+from fusion_service.compiled import use
 from fusion_service.rules import fuse_last
 
 SECOND = 10**9
@@ -248,7 +249,8 @@ def main() -> None:
     parser.add_argument("--scene", action="append", default=[], help="SOURCESxTRACKSxOVERLAP, and no other table")
     given = parser.parse_args()
     scenes = [Load(*map(int, one.split("x"))) for one in given.scene] or SCENES
-    print(f"CPU ms a step; {dict(given.set) or 'defaults'}; load of the machine {os.getloadavg()[0]:.2f}")
+    how = f"{dict(given.set) or 'defaults'}; small matrices by {use('auto')}"
+    print(f"CPU ms a step; {how}; load of the machine {os.getloadavg()[0]:.2f}")
     heads = " ".join(f"{name.split()[-1][:7]:>7}" for name in PARTS)
     print(f"{'scene':<19} {'read':>4} {'step':>8} {heads} {'save':>7} {'pack':>6} {'all':>8} x floor us each")
     for load in scenes:

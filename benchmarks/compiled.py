@@ -1,7 +1,8 @@
 """Small matrices by both roads, plain NumPy and compiled loops: `python -m benchmarks.compiled`.
 
 Of each function of `fusion_service.linalg` that is compiled, and of the consensus of groups: the CPU time of a call at
-n = 4 for batches of several sizes, the best of several rounds in turn, and whether the bits are the same.
+n = 4 for batches of several sizes, the best of several rounds in turn, and whether the bits are the same. Then the rule
+`ci` of unequal covariances with the best weights sought, and with those of an earlier step kept, by both roads.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import numpy as np
 from fusion_service import linalg
 from fusion_service.centre.consensus import consensus
 from fusion_service.compiled import use
+from fusion_service.rules import fuse_last
 
 __all__ = ["main"]
 
@@ -75,6 +77,16 @@ def main() -> None:
             return made.mean, made.covariance, made.others_mean, made.others_covariance
 
         compared("consensus", f"{count} x {rows}", whole, max(1, 2000 // (count * rows)))
+    print(f"\n{'rule ci, weights':<22}{'B x N':>12}{'sought us':>12}{'kept us':>12}{'ratio':>8}  NumPy, then numba")
+    for choice in ("off", "on"):
+        use(choice)
+        for count, rows in GROUPS[:3]:
+            G = rng.normal(size=(rows, 4, 6, count))
+            x, P = rng.normal(size=(rows, 4, count)), np.einsum("sikb,sjkb->sijb", G, G)
+            start = fuse_last("ci", x, P).weights
+            sought = best(lambda x=x, P=P: fuse_last("ci", x, P, influence=True), 3)  # type: ignore[misc]
+            kept = best(lambda x=x, P=P, w=start: fuse_last("ci", x, P, influence=True, start=w), 3)  # type: ignore[misc]
+            print(f"{'':<22}{f'{count} x {rows}':>12}{1e6 * sought:>12.0f}{1e6 * kept:>12.0f}{sought / kept:>8.1f}")
 
 
 if __name__ == "__main__":

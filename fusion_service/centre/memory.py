@@ -27,7 +27,7 @@ from fusion_service.centre.lifecycle import WAYS, Picture
 from fusion_service.centre.motions import Motions, States
 from fusion_service.centre.partial import AXES, PLACED, Unknown
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.shared_noise import SharedNoise
+from fusion_service.centre.shared_noise import shared_noise
 from fusion_service.centre.tracklets import Filters, Operations, closed, run
 from fusion_service.centre.versions import Versions, versions_of
 from fusion_service.centre.watch import UNTRUE, WATCHED, Watch
@@ -126,7 +126,7 @@ class Memory:
         trusted = [chosen or self.watch.records[name].reason not in UNTRUE for name in names]
         sound = ruled & sound_rows(rows) & kinship.alone(self._intake, rows) & ~off_centre(rows, self._config.space)
         sound &= np.array(trusted, dtype=np.bool_)[rows.source]
-        noise = SharedNoise(declared_motions(self._intake), self._config.space)
+        noise = shared_noise(tuple(declared_motions(self._intake)), self._config.space)
         followed = self.derived.follow(rows, names, versions, noise, sound, time)
         if self.derived.beyond:
             journal.refuse(Entry("", 0, 0, 0, "too-many-pairs", self.derived.beyond))

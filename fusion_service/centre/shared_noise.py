@@ -8,6 +8,7 @@ turn does) nothing follows.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 
@@ -15,7 +16,7 @@ from fusion_service.arrays import Floats, Ints
 from fusion_service.motion import predict
 from schemas import Motion
 
-__all__ = ["SharedNoise"]
+__all__ = ["SharedNoise", "shared_noise"]
 
 
 class SharedNoise:
@@ -83,3 +84,9 @@ class SharedNoise:
             moves.append(known.setdefault((F + 0.0).tobytes(), len(known)))
             noise.append(float(np.trace(Q[:, :, 0])))
         return np.array(moves, dtype=np.intp), np.array(noise)
+
+
+@lru_cache(maxsize=16)
+def shared_noise(motions: tuple[Motion | None, ...], space: tuple[str, ...]) -> SharedNoise:
+    """`SharedNoise`, made once for the same motions: sources seldom declare others."""
+    return SharedNoise(motions, space)

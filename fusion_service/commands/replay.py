@@ -50,6 +50,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Fuse it again. Raises `UsageError`, `ConfigError`, `ReviewError`: of --verify too, where the tracks differ."""
+    from fusion_service.compiled import is_kept, use
     from fusion_service.errors import ReviewError, UsageError
     from fusion_service.review.outputs import check_page, check_recording
     from fusion_service.review.replay import run_replay
@@ -60,6 +61,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         check_page(args.json, args.recording, *filter(None, [args.config]))
     if args.out is not None:
         check_recording(args.out, args.recording)
+    if is_kept():  # the same bits, sooner
+        use("auto")
     replay = run_replay(
         args.recording,
         rules=args.rule,

@@ -129,12 +129,14 @@ SHAPES = {
     "intersect": ((2, 3, 0), (2, 3, 1, 2, 3, 1)),
 }
 """Numbers of axes of what each kernel reads, and then writes; 0: places (G, k). `solve` takes a flag at the end."""
+STRIDED = ("invert", "pivots", "ldl", "solve")
+"""Kernels that copy what they read into room of their own, so that it need not be contiguous."""
 HELPERS = ("_turned", "_lowered", "_sum", "_copied", "_solved")
 
 
 def _signature(numba: Any, name: str) -> Any:
     types = numba.types
     kinds = [(types.float64, axes) if axes else (types.int64, 2) for axes in SHAPES[name][0]]
-    read = [types.Array(kind, axes, "C", readonly=True) for kind, axes in kinds]
+    read = [types.Array(kind, axes, "A" if name in STRIDED else "C", readonly=True) for kind, axes in kinds]
     written = [types.Array(types.float64, axes, "C") for axes in SHAPES[name][1]]
     return types.void(*read, *written, *([types.boolean] if name == "solve" else []))

@@ -27,9 +27,14 @@ def _fits(a: Floats, *others: Floats) -> bool:
     return a.dtype == F8 and a.size > 0 and all(one.dtype == F8 for one in others)
 
 
+def _one(a: Floats, core: int) -> Floats:
+    """With one batch axis."""
+    return a if a.ndim == core + 1 else a.reshape(*a.shape[:core], -1)
+
+
 def _flat(a: Floats, core: int) -> Floats:
     """Contiguous, with one batch axis."""
-    return np.ascontiguousarray(a if a.ndim == core + 1 else a.reshape(*a.shape[:core], -1))
+    return np.ascontiguousarray(_one(a, core))
 
 
 def _inverses(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
@@ -37,7 +42,7 @@ def _inverses(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
         if not _fits(P):
             return None
         batch = P.shape[2:]
-        p = _flat(P, 2)
+        p = _one(P, 2)
         out, rest = np.empty(p.shape), np.empty((3, p.shape[2]))
         kernels.invert(p, out, rest[0], rest[1], rest[2])
         return out.reshape(P.shape), rest[0].reshape(batch), rest[1].reshape(batch), rest[2].reshape(batch)
@@ -62,13 +67,13 @@ def _factors(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
         if not _fits(P):
             return None
         d = np.empty((len(P), P[0, 0].size))
-        kernels.pivots(_flat(P, 2), d)
+        kernels.pivots(_one(P, 2), d)
         return d.reshape(P.shape[1:])
 
     def ldl(P: Floats) -> tuple[Floats, Floats] | None:
         if not _fits(P):
             return None
-        p = _flat(P, 2)
+        p = _one(P, 2)
         L, d = np.empty(p.shape), np.empty(p.shape[1:])
         kernels.ldl(p, L, d)
         return L.reshape(P.shape), d.reshape(P.shape[1:])
@@ -76,7 +81,7 @@ def _factors(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     def solved(P: Floats, x: Floats, back: bool) -> Floats | None:
         if not _fits(P, x) or P.shape[1:] != x.shape:
             return None
-        p, y = _flat(P, 2), _flat(x, 1)
+        p, y = _one(P, 2), _one(x, 1)
         solution, square = np.empty(y.shape if back else (1, 1)), np.empty(1 if back else y.shape[1])
         kernels.solve(p, y, solution, square, back)
         return solution.reshape(x.shape) if back else square.reshape(x.shape[1:])

@@ -157,13 +157,17 @@ def _newton(X: Floats, ends: Floats, C: Floats | None, t: Floats) -> tuple[Float
     pairs = [(a, b) for a in range(n) for b in range(a + 1)]
     twice = np.array([1.0 if a == b else 2.0 for a, b in pairs])
     g = np.stack([slope[a, b] for a, b in pairs]) * twice[:, None]
-    H = np.empty((len(pairs), len(pairs), *t.shape), X.dtype)
-    for row, (a, b) in enumerate(pairs):
-        for column, (c, d) in enumerate(pairs[: row + 1]):
-            both = 0.5 * twice[row] * twice[column]
-            H[row, column] = H[column, row] = both * total(
-                np.stack([s * total(M[a, c] * M[b, d] + M[a, d] * M[b, c]) for M, s in curved])
-            )
+    first, second = np.array(pairs).T
+    both = 0.5 * twice[:, None] * twice
+    H = np.zeros((len(pairs), len(pairs), *t.shape), X.dtype)
+    for M, s in curved:
+        for i in range(M.shape[2]):
+            A = M[:, :, i]
+            square = A[first[:, None], first] * A[second[:, None], second]
+            square += A[first[:, None], second] * A[second[:, None], first]
+            square *= s
+            H += square
+    H *= both[..., None]
     step = -linalg.solve(H, g)
     decrement = np.sqrt(np.maximum(-total(g * step), 0.0))
     D = np.empty_like(X)

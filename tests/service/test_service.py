@@ -281,6 +281,7 @@ def test_mistakes_are_one_line_that_says_how_to_mend_them(arguments: list[str], 
 def test_a_second_service_on_the_same_state_is_refused(scene: Scene) -> None:
     scene.service()
     eventually(lambda: scene.seen.statuses, 15)
+    assert scene.last_status().road == "plain"
     code, errors = scene.service().end()
     assert code == 1
     assert "another service uses the state folder" in errors
