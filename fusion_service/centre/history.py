@@ -1,6 +1,7 @@
 """What a centre keeps of its newest steps, so that they can be made again when late data belong to them.
 
-Of every step of the last `lateness` it keeps what went into it: orders, sources that came and went, the messages
+Of every step of the last `lateness`, and of so much more as late data may have to wait for their turn, it keeps what
+went into it: orders, sources that came and went, the messages
 taken. Of some it keeps the state before them, as a checkpoint: one in about an eighth of `lateness`, fewer where the
 tables are large, and of the newest `RECENT` while data come late. A message is late where a step that was made should
 have taken it, by its time. Before the next step the centre then goes back to the newest kept state before that one, and
@@ -86,6 +87,7 @@ class History:
     def __init__(self, config: CentreConfig) -> None:
         self._lateness = round(config.lateness * 1e9)
         self._pace = config.revise
+        self._window = round(self._lateness * (min(2.0, self._pace / (self._pace - 1)) if self._pace > 1 else 2.0))
         self.on = self._pace > 0 and self._lateness > 0
         self.past: list[Past] = []
         self.late: Counter[str] = Counter()
@@ -224,7 +226,7 @@ class History:
         for old in self.past[:-RECENT][-BUSY:]:
             if not old.lasting:
                 old.state = None
-        self._trim(one.time - self._lateness)
+        self._trim(one.time - self._window)
 
     def _owe(self, key: Key, due: int, before: int) -> None:
         if before >= 0 and due <= before and len(self._owed) < MOST_OWED:
