@@ -28,8 +28,18 @@ ELSEWHERE = {
 """Pages that are not below docs/: path in the repository, name in the site."""
 SECTIONS = {
     "Use it": [
-        *("tutorial", "operating", "judgement", "supervision", "registration", "conduct", "platforms", "extent"),
-        *("tracklets", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
+        *(
+            "tutorial",
+            "operating",
+            "arrival",
+            "judgement",
+            "supervision",
+            "registration",
+            "conduct",
+            "platforms",
+            "extent",
+        ),
+        *("tracklets", "late", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "rules-speed"],
     "API": ["api/*"],

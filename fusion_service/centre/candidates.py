@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Floats, Ints, picked
 from fusion_service.centre.association import overlap
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import Judgement
@@ -75,8 +75,8 @@ def find_candidates(
     mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
     loose = np.flatnonzero(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
     known = np.flatnonzero(now.time >= 0)
-    means = np.concatenate([mean[:, known], tracks.mean[:, loose]], axis=1)
-    covariances = np.concatenate([covariance[:, :, known], tracks.covariance[:, :, loose]], axis=2)
+    means = np.concatenate([picked(mean, known), picked(tracks.mean, loose)], axis=1)
+    covariances = np.concatenate([picked(covariance, known), picked(tracks.covariance, loose)], axis=2)
     source = np.concatenate([np.full(len(known), -1), rows.source[loose]])
     compartment = np.concatenate([meeting.compartment_of_tracks[known], meeting.compartment_of_rows[loose]])
     gates = np.concatenate([np.tile(tests.gate[:, None], len(known)), rows.gate[:, loose]], axis=1)
@@ -145,7 +145,7 @@ class _Without:
 
     def state(self, row: Ints, track: Ints) -> tuple[Floats, Floats]:
         """Mean (n, K) and covariance (n, n, K) of the tracks without the sources of the rows."""
-        mean, covariance = self._mean[:, track], self._covariance[:, :, track]
+        mean, covariance = picked(self._mean, track), picked(self._covariance, track)
         if len(self._keys):
             key = self._rows.source[row] * self._width + track
             at = np.minimum(np.searchsorted(self._keys, key), len(self._keys) - 1)
@@ -154,18 +154,18 @@ class _Without:
             agreed = self._judged.agreed
             others = agreed.size[place] > 1
             some, alone = mine[others], mine[~others]
-            mean[:, some] = agreed.others_mean[:, place[others]]
-            covariance[:, :, some] = agreed.others_covariance[:, :, place[others]]
-            mean[:, alone] = self._now.mean[:, track[alone]]
-            covariance[:, :, alone] = self._now.covariance[:, :, track[alone]]
+            mean[:, some] = picked(agreed.others_mean, place[others])
+            covariance[:, :, some] = picked(agreed.others_covariance, place[others])
+            mean[:, alone] = picked(self._now.mean, track[alone])
+            covariance[:, :, alone] = picked(self._now.covariance, track[alone])
         return mean, covariance
 
     def _distances(self, row: Ints, track: Ints) -> tuple[Floats, Floats, Ints]:
         distance, size, count = np.empty(len(row)), np.empty(len(row)), np.empty(len(row), dtype=np.intp)
         for part in linalg.blocks(len(self._mean), len(row)):
             mean, covariance = self.state(row[part], track[part])
-            spread = covariance + self._rows.tracks.covariance[:, :, row[part]]
-            offset = self._rows.tracks.mean[:, row[part]] - mean
+            spread = covariance + picked(self._rows.tracks.covariance, row[part])
+            offset = picked(self._rows.tracks.mean, row[part]) - mean
             distance[part], size[part], count[part] = apart(spread, offset, self._unknown)
         return distance, size, count
 
@@ -201,7 +201,7 @@ def _gated(
     distance, spread, size = np.empty(len(i)), np.empty(len(i)), np.empty(len(i), dtype=np.intp)
     for part in linalg.blocks(len(means), len(i)):
         a, b = i[part], j[part]
-        both, offset = covariances[:, :, a] + covariances[:, :, b], means[:, a] - means[:, b]
+        both, offset = picked(covariances, a) + picked(covariances, b), picked(means, a) - picked(means, b)
         distance[part], spread[part], size[part] = apart(both, offset, unknown)
     if parts is not None:
         several = np.isfinite(parts.log_weights).sum(axis=0) > 1

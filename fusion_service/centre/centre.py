@@ -257,6 +257,14 @@ class Centre(ABC):
         """What orders are judged by now, as it is: no copy that later steps leave alone."""
         return view_of(self._intake, self._picture, self._time)
 
+    def let_go(self, tracks: NDArray[np.uint64]) -> int:
+        """Forget global tracks that have ended since the checkpoint that this centre was made from; how many it had."""
+        gone = np.isin(self._picture.id, tracks)
+        self._forget(self._picture.id[gone].tolist())
+        self._picture = self._picture.take(~gone)
+        self._state = None
+        return int(gone.sum())
+
     def checkpoint(self) -> bytes:
         """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""
         state = {
@@ -320,11 +328,9 @@ class Centre(ABC):
 
     def _end_all(self, tracks: NDArray[np.uint64], reason: str) -> None:
         """End those of these global tracks that there are."""
-        gone = np.isin(self._picture.id, tracks)
-        for track in self._picture.id[gone].tolist():
+        for track in self._picture.id[np.isin(self._picture.id, tracks)].tolist():
             self._journal.end(track, reason, None)
-        self._forget(self._picture.id[gone].tolist())
-        self._picture = self._picture.take(~gone)
+        self.let_go(tracks)
 
     def _forget_lineages(self) -> None:
         """Let go the lineages that nothing has any more, where they are many."""

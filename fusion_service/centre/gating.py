@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, picked
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -72,7 +72,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     jumped = fresh & (predicted > tests.keep[seen])
     outside = np.where(fresh, jumped, tracks.outside[linked])
     some = np.flatnonzero(~outside if rows.out is None else ~outside & ~rows.out[linked])
-    agreed = consensus(links[some], tracks.mean[:, linked[some]], tracks.covariance[:, :, linked[some]])
+    agreed = consensus(links[some], picked(tracks.mean, linked[some]), picked(tracks.covariance, linked[some]))
     distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
     failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep[shared])
@@ -102,12 +102,12 @@ def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensu
     links = tracks.link[inside]
     labels, group = np.unique(links, return_inverse=True)
     at = np.searchsorted(agreed.labels, labels)
-    mean, covariance = agreed.mean[:, at], agreed.covariance[:, :, at]
-    others_mean, others_covariance = agreed.others_mean[:, kept], agreed.others_covariance[:, :, kept]
+    mean, covariance = picked(agreed.mean, at), picked(agreed.covariance, at)
+    others_mean, others_covariance = picked(agreed.others_mean, kept), picked(agreed.others_covariance, kept)
     size = agreed.size[kept]
     fewer = np.flatnonzero(size != np.bincount(group, minlength=len(labels))[group])
     some = inside[fewer]
-    anew = consensus(links[fewer], tracks.mean[:, some], tracks.covariance[:, :, some])
+    anew = consensus(links[fewer], picked(tracks.mean, some), picked(tracks.covariance, some))
     changed = np.searchsorted(labels, anew.labels)
     mean[:, changed], covariance[:, :, changed] = anew.mean, anew.covariance
     others_mean[:, fewer], others_covariance[:, :, fewer] = anew.others_mean, anew.others_covariance
@@ -121,10 +121,10 @@ def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings
     tracks = rows.tracks
     at = now.find(tracks.link[linked])
     seconds = np.maximum(time - now.seen[at], 0) / 1e9
-    spread = tracks.covariance[:, :, linked] + now.covariance[:, :, at]
+    spread = picked(tracks.covariance, linked) + picked(now.covariance, at)
     spread += manoeuvred(settings.space, settings.manoeuvre, seconds)
     size, _ = settings.tests.unknown.common(spread)
-    distance = linalg.quadratic(spread, tracks.mean[:, linked] - now.mean[:, at])
+    distance = linalg.quadratic(spread, picked(tracks.mean, linked) - picked(now.mean, at))
     return np.where(now.time[at] >= 0, np.where(np.isnan(distance), np.inf, distance), 0.0), size
 
 
@@ -133,8 +133,8 @@ def _from_others(rows: Rows, some: Ints, agreed: Consensus, tests: Tests) -> tup
     distance, size = np.full(len(some), np.nan), np.zeros(len(some), dtype=np.intp)
     several = np.flatnonzero(agreed.size > 1)
     at = some[several]
-    spread = rows.tracks.covariance[:, :, at] + agreed.others_covariance[:, :, several]
-    distance[several] = linalg.quadratic(spread, rows.tracks.mean[:, at] - agreed.others_mean[:, several])
+    spread = picked(rows.tracks.covariance, at) + picked(agreed.others_covariance, several)
+    distance[several] = linalg.quadratic(spread, picked(rows.tracks.mean, at) - picked(agreed.others_mean, several))
     size[several], _ = tests.unknown.common(spread)
     return distance, size
 

@@ -37,6 +37,8 @@ MOST_ROWS = 1_000_000
 """Tracks, local and global, in all kept states together; above that there are fewer states, but two at least."""
 RECENT = 3
 """Newest states that are kept while data come late."""
+JUST = 1_000_000
+"""ns: on arrival, a scan of that much before the newest step belongs to it as much as to one of its own."""
 BUSY = 20
 """Steps for which they are kept after the last late message."""
 MOST_STEPS = 2000
@@ -88,6 +90,7 @@ class History:
         self._lateness = round(config.lateness * 1e9)
         self._pace = config.revise
         self._window = round(self._lateness * (min(2.0, self._pace / (self._pace - 1)) if self._pace > 1 else 2.0))
+        self._just = JUST if config.trigger == "arrival" else 0
         self.on = self._pace > 0 and self._lateness > 0
         self.past: list[Past] = []
         self.late: Counter[str] = Counter()
@@ -132,7 +135,7 @@ class History:
             if not isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks)):
                 continue
             due = event.time - intake.treatment(source_of(event)).clock
-            if due > last or event.time < last - self._lateness:
+            if due > last - self._just or event.time < last - self._lateness:
                 continue
             try:
                 code = digest(event)
@@ -229,7 +232,7 @@ class History:
         self._trim(one.time - self._window)
 
     def _owe(self, key: Key, due: int, before: int) -> None:
-        if before >= 0 and due <= before and len(self._owed) < MOST_OWED:
+        if before >= 0 and due <= before - self._just and len(self._owed) < MOST_OWED:
             self._owed[key] = due
 
     def _trim(self, oldest: int) -> None:

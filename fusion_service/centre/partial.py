@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -52,13 +53,7 @@ class Unknown:
     @classmethod
     def of(cls, space: tuple[str, ...], speed: float = 100.0, acceleration: float = 20.0) -> Unknown:
         """speed, acceleration: one sigma of what targets may have, m/s, m/s2."""
-        likely = {"x": 1.0, "y": 1.0, "z": PLAUSIBLE_HEIGHT, "turn_rate": PLAUSIBLE_TURN}
-        likely |= dict.fromkeys(("vx", "vy", "vz"), max(speed, 1e-3))
-        likely |= dict.fromkeys(("ax", "ay", "az"), max(acceleration, 1e-3))
-        sigma = np.array([SIGMA[name] for name in space])
-        plausible = np.array([likely[name] for name in space])
-        limit = np.array([UNKNOWN_SIGMA.get(name, np.inf) for name in space])
-        return cls(space, limit**2, sigma**2, plausible**2)
+        return _unknown(tuple(space), speed, acceleration)
 
     def known(self, covariance: Floats) -> NDArray[np.bool_]:
         """Which components (n, ...) of densities with `covariance` (n, n, ...) are known."""
@@ -101,6 +96,17 @@ class Unknown:
                 count -= missing
                 more = np.where(missing, more + np.log(plausible / np.where(missing, spread[k, k], 1.0)), more)
         return count, more
+
+
+@lru_cache(maxsize=256)
+def _unknown(space: tuple[str, ...], speed: float, acceleration: float) -> Unknown:
+    likely = {"x": 1.0, "y": 1.0, "z": PLAUSIBLE_HEIGHT, "turn_rate": PLAUSIBLE_TURN}
+    likely |= dict.fromkeys(("vx", "vy", "vz"), max(speed, 1e-3))
+    likely |= dict.fromkeys(("ax", "ay", "az"), max(acceleration, 1e-3))
+    sigma = np.array([SIGMA[name] for name in space])
+    plausible = np.array([likely[name] for name in space])
+    limit = np.array([UNKNOWN_SIGMA.get(name, np.inf) for name in space])
+    return Unknown(space, limit**2, sigma**2, plausible**2)
 
 
 def patterns(known: Bools) -> Iterator[tuple[Ints, Any]]:

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, picked
 from fusion_service.centre.words import Codes
 from fusion_service.densities import Mixtures
 
@@ -236,7 +236,7 @@ def taken(columns: Any, rows: Any) -> Any:
     """Columns, (..., T) each, of the given rows (indices or a mask): the same ones where a mask holds for all."""
     names = [one.name for one in fields(columns)]
     if not isinstance(rows, np.ndarray) or rows.dtype != np.bool_:
-        return type(columns)(*(getattr(columns, name)[..., rows] for name in names))
+        return type(columns)(*(picked(getattr(columns, name), rows) for name in names))
     if rows.all():
         return columns
     at = np.flatnonzero(rows)

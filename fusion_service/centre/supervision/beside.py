@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints, to_bytes
+from fusion_service.arrays import Bools, Floats, Ints, picked, to_bytes
 from fusion_service.centre.derived import rows_of
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.supervision.shared import Shared
@@ -42,7 +42,7 @@ class Met:
 
     def take(self, some: Any) -> Met:
         """Some of them."""
-        return Met(*(getattr(self, one.name)[..., some] for one in fields(self)))
+        return Met(*(picked(getattr(self, one.name), some) for one in fields(self)))
 
 
 class Beside:
@@ -71,7 +71,7 @@ class Beside:
         last = np.full((self._n, len(asked)), np.nan)
         if len(key):
             known = key[order][at] == asked
-            last[:, known] = old.difference[:, order[at[known]]]
+            last[:, known] = picked(old.difference, order[at[known]])
         self._quiet = old.take(there & ~self._fresh(rows, one, two))
         self._names = names
         self._quiet = Met(number[self._quiet.source], *(getattr(self._quiet, f.name) for f in fields(Met)[1:]))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, picked
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.supervision.bias import design
@@ -93,7 +93,7 @@ def chosen_rows(rows: Rows, label: NDArray[np.uint64], now: Picture, whose: Ints
 
 def _plausible(tracks: Tracks | Picture, at: Ints) -> Bools:
     """Which states (K,) are near enough, slow enough and known well enough to be compared."""
-    state = np.abs(tracks.mean[:, at]).max(axis=0, initial=0.0) < LARGEST
+    state = np.abs(picked(tracks.mean, at)).max(axis=0, initial=0.0) < LARGEST
     variance = tracks.covariance[0, 0, at] + tracks.covariance[1, 1, at]
     return np.asarray(state & (variance < LARGEST))
 
@@ -116,7 +116,7 @@ def compared(
     value = how.value[source]
     z = rows.tracks.mean[xy][:, row] - place[:, group]
     z = z + sum(H[:, k] * value[:, k] for k in range(value.shape[1]))
-    own = rows.tracks.covariance[np.ix_(xy, xy)][..., row]
+    own = picked(rows.tracks.covariance[np.ix_(xy, xy)], row)
     if how.common.any() or how.shift.any():
         own = _own(own, H, how.common[source], how.shift[..., source])
     own = own + FINEST * np.eye(2)[:, :, None]

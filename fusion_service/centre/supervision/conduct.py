@@ -192,6 +192,9 @@ class Conduct:
     def _twice(self, source: Source, record: _Record, found: Moves, time: int, journal: Journal) -> None:
         """One identity in two tracks of one source, neither overdue, and one with new data."""
         tracks = source.tracks
+        if not (tracks.identity != NONE).any():
+            record.twice = {}
+            return
         recent = source.last - tracks.time <= tracks.interval + tracks.interval // 2
         named = np.flatnonzero((tracks.identity != NONE) & recent)
         code = tracks.identity[named]

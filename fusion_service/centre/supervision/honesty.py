@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, from_bytes, to_bytes
+from fusion_service.arrays import Bools, Floats, Ints, from_bytes, picked, to_bytes
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.supervision.beside import Beside
@@ -113,7 +113,7 @@ class Honesty:
         pair = self._places(key)
         fine = pair >= 0
         first, second, held, last, pair = first[fine], second[fine], held[fine], last[:, fine], pair[fine]
-        difference = rows.tracks.mean[:, first] - rows.tracks.mean[:, second]
+        difference = picked(rows.tracks.mean, first) - picked(rows.tracks.mean, second)
         known = self._unknown.known(rows.tracks.covariance)
         whitened = np.full_like(difference, np.nan)
         for block, index in enumerate(self._blocks):
@@ -122,7 +122,7 @@ class Honesty:
             some = np.flatnonzero((known[index][:, first] & known[index][:, second]).all(axis=0))
             one, two = first[some], second[some]
             P, Q = (
-                rows.tracks.covariance[index[:, None], index[None], :][..., at] / inflation[block, rows.source[at]]
+                picked(rows.tracks.covariance[index[:, None], index[None], :], at) / inflation[block, rows.source[at]]
                 for at in (one, two)
             )
             r = difference[index][:, some]

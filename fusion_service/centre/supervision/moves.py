@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats
+from fusion_service.arrays import Bools, Floats, picked
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.sources import Source
 from fusion_service.centre.tracks import Tracks
@@ -78,7 +78,12 @@ def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, conf
     if count == len(before.id) == len(new.id):
         x, y, P, R = before.mean, new.mean, before.covariance, new.covariance
     else:
-        x, y, P, R = before.mean[:, was], new.mean[:, at], before.covariance[:, :, was], new.covariance[:, :, at]
+        x, y, P, R = (
+            picked(before.mean, was),
+            picked(new.mean, at),
+            picked(before.covariance, was),
+            picked(new.covariance, at),
+        )
     again = np.asarray((x == y).all(axis=0))
     if again.any():
         again[again] = (P[:, :, again] == R[:, :, again]).all(axis=(0, 1))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Floats, Ints, picked
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.supervision.gauge import connected
 from fusion_service.centre.supervision.matching import FEWEST, Tracks2, match
@@ -132,5 +132,5 @@ def _lonely(rows: Rows, whose: Ints) -> list[tuple[int, int]]:
 
 def _plane(rows: Rows, at: Ints, space: tuple[str, ...]) -> Tracks2:
     xy, v = [space.index("x"), space.index("y")], [space.index("vx"), space.index("vy")]
-    mean, covariance = rows.tracks.mean[:, at], rows.tracks.covariance[:, :, at]
+    mean, covariance = picked(rows.tracks.mean, at), picked(rows.tracks.covariance, at)
     return Tracks2(mean[xy], mean[v], covariance[np.ix_(xy, xy)], covariance[np.ix_(v, v)])
