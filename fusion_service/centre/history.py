@@ -2,8 +2,8 @@
 
 Of every step of the last `lateness`, and of so much more as late data may have to wait for their turn, it keeps what
 went into it: orders, sources that came and went, the messages taken. Of some it keeps the state before them, as a
-checkpoint: one in about an eighth of `lateness`, fewer where the tables are large, and of the newest `RECENT` while data
-come late. A message is late where a step that was made should have taken it, by its time. Before the next step the
+checkpoint: one in about an eighth of `lateness`, fewer where the tables are large, and of the newest `RECENT` while
+data come late. A message is late where a step that was made should have taken it, by its time. Before the next step the
 centre then goes back to the newest kept state before that one, and makes the steps from there again with all of their
 inputs, each where it belongs by its time.
 
