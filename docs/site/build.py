@@ -39,7 +39,7 @@ SECTIONS = {
             "platforms",
             "extent",
         ),
-        *("tracklets", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
+        *("tracklets", "late", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "rules-speed"],
     "API": ["api/*"],

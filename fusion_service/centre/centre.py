@@ -262,6 +262,7 @@ class Centre(ABC):
         gone = np.isin(self._picture.id, tracks)
         self._forget(self._picture.id[gone].tolist())
         self._picture = self._picture.take(~gone)
+        self._state = None
         return int(gone.sum())
 
     def checkpoint(self) -> bytes:

@@ -1,10 +1,11 @@
 """What a centre keeps of its newest steps, so that they can be made again when late data belong to them.
 
-Of every step of the last `lateness` it keeps what went into it: orders, sources that came and went, the messages
-taken. Of some it keeps the state before them, as a checkpoint: one in about an eighth of `lateness`, fewer where the
-tables are large, and of the newest `RECENT` while data come late. A message is late where a step that was made should
-have taken it, by its time. Before the next step the centre then goes back to the newest kept state before that one, and
-makes the steps from there again with all of their inputs, each where it belongs by its time.
+Of every step of the last `lateness`, and of so much more as late data may have to wait for their turn, it keeps what
+went into it: orders, sources that came and went, the messages taken. Of some it keeps the state before them, as a
+checkpoint: one in about an eighth of `lateness`, fewer where the tables are large, and of the newest `RECENT` while
+data come late. A message is late where a step that was made should have taken it, by its time. Before the next step the
+centre then goes back to the newest kept state before that one, and makes the steps from there again with all of their
+inputs, each where it belongs by its time.
 
 Once in a step at most, and no more than `revise` steps for each step on the average: what there is no room for now is
 taken as it comes, and put in its place when steps are made again the next time. So the cost of late data is bounded,
@@ -20,13 +21,23 @@ from dataclasses import dataclass, field, replace
 
 from fusion_service.centre.events import Event, SourceFound, SourceLost
 from fusion_service.centre.intake import MAX_ORDERS, MAX_SOURCES, Intake
-from fusion_service.centre.pictures import source_of
-from fusion_service.centre.refusing import would_refuse
+from fusion_service.centre.pictures import as_scan, source_of
+from fusion_service.centre.refusing import fault
 from fusion_service.centre.scans import size_of
 from fusion_service.centre.spared import Spared
 from fusion_service.config import CentreConfig
 from fusion_service.order import Order
-from schemas import Entry, GlobalTracks, LocalIntensity, LocalTracks, Message, MessageError, Status, digest
+from schemas import (
+    Entry,
+    GlobalTracks,
+    LocalIntensity,
+    LocalTracks,
+    Message,
+    MessageError,
+    Status,
+    check_source,
+    digest,
+)
 
 __all__ = ["History", "Key", "Late", "Past", "key_of"]
 
@@ -88,6 +99,7 @@ class History:
     def __init__(self, config: CentreConfig) -> None:
         self._lateness = round(config.lateness * 1e9)
         self._pace = config.revise
+        self._window = round(self._lateness * (min(2.0, self._pace / (self._pace - 1)) if self._pace > 1 else 2.0))
         self._just = JUST if config.trigger == "arrival" else 0
         self.on = self._pace > 0 and self._lateness > 0
         self.past: list[Past] = []
@@ -140,7 +152,7 @@ class History:
             except MessageError:
                 continue
             key = source_of(event), event.epoch, event.seq, code
-            if key not in found and not would_refuse(intake, event, code, received, last):
+            if key not in found and not _would_be_refused(intake, event, code, received, last):
                 found[key] = Late(key, due, event, received)
         return list(found.values())
 
@@ -227,7 +239,7 @@ class History:
         for old in self.past[:-RECENT][-BUSY:]:
             if not old.lasting:
                 old.state = None
-        self._trim(one.time - self._lateness)
+        self._trim(one.time - self._window)
 
     def _owe(self, key: Key, due: int, before: int) -> None:
         if before >= 0 and due <= before - self._just and len(self._owed) < MOST_OWED:
@@ -249,3 +261,18 @@ class History:
                 break
         del self.past[:cut]
         self._size = size
+
+
+def _would_be_refused(intake: Intake, event: Message, code: int, received: int, last: int) -> bool:
+    """Whether a message of the digest `code` would be refused in the next step after one at `last`, ns."""
+    name = source_of(event)
+    try:
+        check_source(name)
+    except ValueError:
+        return True
+    source = intake.sources.get(name)
+    if source is None and intake.is_full:
+        return True
+    message = as_scan(event, intake.config, intake.frame)
+    about = source or intake.blank(name)
+    return bool(fault(intake.config, about, message, code, last, received, lambda one: intake.is_stale(one, last + 1)))

@@ -51,7 +51,7 @@ from schemas import (
     digest,
 )
 
-__all__ = ["MAX_TOTAL", "Intake"]
+__all__ = ["MAX_ORDERS", "MAX_SOURCES", "MAX_TOTAL", "Intake"]
 
 MAX_SOURCES = 1000
 MAX_TRACKS = 20_000
@@ -289,7 +289,8 @@ class Intake:
         for (name, epoch, seq, kind, code, received), message in messages:
             entry = Entry(name, epoch, seq, code)
             known = self.sources.get(name)
-            reason = fault(self, known or self.blank(name), message, code, time, last, received)
+            about = known or self.blank(name)
+            reason = fault(self.config, about, message, code, last, received, lambda one: self.is_stale(one, time))
             source = None if reason else known or self.admitted(name)
             if source is None:
                 journal.refuse(replace(entry, reason=reason or "too-many-sources"))

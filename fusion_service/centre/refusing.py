@@ -7,24 +7,29 @@ centre does not fuse), length, bad-info, too-many-tracks, too-many-sources.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 from fusion_service.centre.clock import horizon
-from fusion_service.centre.pictures import as_scan, is_own, source_of
+from fusion_service.centre.pictures import is_own
 from fusion_service.centre.scans import fits, is_sound
-from schemas import LocalIntensity, LocalTracks, Message, SensorInfo, check_source
+from fusion_service.centre.sources import Source
+from fusion_service.config import CentreConfig
+from schemas import LocalIntensity, LocalTracks, Message, SensorInfo
 
-if TYPE_CHECKING:
-    from fusion_service.centre.intake import Intake
-    from fusion_service.centre.sources import Source
-
-__all__ = ["fault", "would_refuse"]
+__all__ = ["fault"]
 
 
-def fault(intake: Intake, source: Source, message: Message, code: int, time: int, last: int, received: int) -> str:
-    """Why `message` of the digest `code`, received at `received`, is refused in the step at `time` after one at `last`,
-    ns; empty where it is not."""
-    config = intake.config
+def fault(
+    config: CentreConfig,
+    source: Source,
+    message: Message,
+    code: int,
+    last: int,
+    received: int,
+    stale: Callable[[Source], bool],
+) -> str:
+    """Why `message` of the digest `code`, received at `received`, is refused in the step after one at `last`, ns; empty
+    where it is not. stale: whether a source has been silent for long."""
     if not isinstance(message, (LocalTracks, LocalIntensity, SensorInfo)):
         return "type"
     if source.muted:
@@ -37,7 +42,7 @@ def fault(intake: Intake, source: Source, message: Message, code: int, time: int
     started = -1 if message.epoch == source.epoch else message.epoch
     if max(started, holds) > horizon(received, config):
         return "future"
-    if message.epoch < source.epoch and not intake.is_stale(source, time):
+    if message.epoch < source.epoch and not stale(source):
         return "old-epoch"
     if message.epoch == source.epoch and source.is_repeat(message.type, message.seq, code):
         return "repeat"
@@ -50,17 +55,3 @@ def fault(intake: Intake, source: Source, message: Message, code: int, time: int
     if isinstance(message, LocalIntensity) is not (config.kind == "intensity"):
         return "intensity" if isinstance(message, LocalIntensity) else "tracks"
     return "" if fits(message) else "length"
-
-
-def would_refuse(intake: Intake, event: Message, code: int, received: int, last: int) -> bool:
-    """Whether a message of the digest `code` would be refused in the next step after one at `last`, ns."""
-    name = source_of(event)
-    try:
-        check_source(name)
-    except ValueError:
-        return True
-    source = intake.sources.get(name)
-    if source is None and intake.is_full:
-        return True
-    message = as_scan(event, intake.config, intake.frame)
-    return bool(fault(intake, source or intake.blank(name), message, code, last + 1, last, received))

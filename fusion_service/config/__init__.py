@@ -1,6 +1,7 @@
 """One TOML file -> frozen dataclasses."""
 
 from fusion_service.config.config import (
+    BEFORE,
     BusConfig,
     CentreConfig,
     ConfigError,
@@ -13,6 +14,7 @@ from fusion_service.config.example import example_toml
 from fusion_service.config.loading import centre_config, load_config
 
 __all__ = [
+    "BEFORE",
     "BusConfig",
     "CentreConfig",
     "ConfigError",

@@ -43,11 +43,22 @@ from fusion_service.config.readers import (
 from fusion_service.errors import FusionError
 from schemas import ORIGINS, STATUSES, Coverage, Frame, Height, Motion, check_name, check_realm, check_space
 
-__all__ = ["BusConfig", "CentreConfig", "ConfigError", "DaemonConfig", "ServiceConfig", "SourceConfig", "config_hash"]
+__all__ = [
+    "BEFORE",
+    "BusConfig",
+    "CentreConfig",
+    "ConfigError",
+    "DaemonConfig",
+    "ServiceConfig",
+    "SourceConfig",
+    "config_hash",
+]
 
 
-LATER = ("trigger", "arrival_spacing")
-"""Settings that came after hashes were recorded; their defaults are what there was before."""
+LATER = ("trigger", "arrival_spacing", "revise", "weights", "compiled")
+"""Settings that came after hashes were recorded; their defaults are what there was before, or `BEFORE` says."""
+BEFORE: dict[str, Any] = {"revise": 0.0, "weights": "best"}
+"""What stands where recorded settings do not say them."""
 
 
 class ConfigError(FusionError, ValueError):
@@ -289,7 +300,7 @@ def config_hash(config: CentreConfig) -> str:
     ever."""
     settings = dataclasses.asdict(config)
     for one in dataclasses.fields(config):
-        if one.name in LATER and settings[one.name] == one.default:
+        if one.name in LATER and settings[one.name] == BEFORE.get(one.name, one.default):
             del settings[one.name]
     plain = json.dumps(settings, sort_keys=True, default=_plain)
     return hashlib.sha256((plain + str(getattr(config.frame, "kind", ""))).encode()).hexdigest()[:16]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from fusion_service import __version__
 from fusion_service.centre import is_picture_of
-from fusion_service.config import CentreConfig, ConfigError, centre_config, config_hash
+from fusion_service.config import BEFORE, CentreConfig, ConfigError, centre_config, config_hash
 from fusion_service.config.settings import nested, plain_settings
 from fusion_service.errors import ReviewError
 from fusion_service.recording.survey import RecordedCentre, Survey
@@ -38,7 +38,7 @@ class MissionSettings:
         self.remarks: list[str] = []
         self.foreign = ""
         self._given = None if given is None else nested(plain_settings(given))
-        self._recorded = {} if followed is None else followed.settings
+        self._recorded = {} if followed is None else {code: BEFORE | one for code, one in followed.settings.items()}
         self._doubts: dict[str, str] = {}
         self.told = "the config given" if given is not None else "its own settings"
         if followed is None or (by_clock and not self._recorded and given is None):
