@@ -166,7 +166,7 @@ def _pack_columns(columns: Tracks | Picture) -> dict[str, Any]:
     packed: dict[str, Any] = {"components": len(columns.log_weight)}
     for one in fields(columns):
         column = getattr(columns, one.name)
-        packed[one.name] = memoryview(np.ascontiguousarray(column, column.dtype.newbyteorder("<")))  # packed uncopied
+        packed[one.name] = np.ascontiguousarray(column, column.dtype.newbyteorder("<")).data  # packed uncopied
     return packed
 
 
