@@ -23,6 +23,7 @@ from fusion_service.centre.intake import MAX_ORDERS, MAX_SOURCES, Intake
 from fusion_service.centre.pictures import source_of
 from fusion_service.centre.refusing import would_refuse
 from fusion_service.centre.scans import size_of
+from fusion_service.centre.spared import Spared
 from fusion_service.config import CentreConfig
 from fusion_service.order import Order
 from schemas import Entry, GlobalTracks, LocalIntensity, LocalTracks, Message, MessageError, Status, digest
@@ -61,12 +62,14 @@ class Late:
 @dataclass(slots=True, eq=False)
 class Past:
     """A step that was made: its time and that of the one before it, ns; events and messages that went into it, with
-    when they came; state: the checkpoint before it, lasting: as one of the few that are kept for long."""
+    when they came; spared: whose silence said nothing before it; state: the checkpoint before it, lasting: as one of
+    the few that are kept for long."""
 
     number: int
     time: int
     before: int
     events: tuple[tuple[Event, int], ...]
+    spared: Spared
     inputs: list[tuple[Message, int]] = field(default_factory=list)
     state: bytes | None = None
     lasting: bool = False
@@ -79,8 +82,8 @@ def key_of(entry: Entry) -> Key:
 
 
 class History:
-    """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source;
-    revised: steps made again since the start."""
+    """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source,
+    and reordered, those of them that came after a later one; revised: steps made again since the start."""
 
     def __init__(self, config: CentreConfig) -> None:
         self._lateness = round(config.lateness * 1e9)
@@ -89,6 +92,7 @@ class History:
         self.on = self._pace > 0 and self._lateness > 0
         self.past: list[Past] = []
         self.late: Counter[str] = Counter()
+        self.reordered: Counter[str] = Counter()
         self.revised = 0
         self._credit = 0.0
         self._busy = 0
@@ -199,7 +203,10 @@ class History:
         if not self.late:
             return status
         queue = dict(status.queue) | {"late": self.late.total(), "revised": self.revised}
-        sources = {name: entry | {"late": self.late[name]} for name, entry in status.sources.items()}
+        sources = {
+            name: entry | {"late": self.late[name], "reordered": entry["reordered"] + self.reordered[name]}
+            for name, entry in status.sources.items()
+        }
         return replace(status, queue=queue, sources=sources)
 
     def add(self, one: Past, raw: dict[Key, tuple[Message, int, int]], taken: Iterable[Entry], owes: bool) -> None:
