@@ -60,11 +60,11 @@ def slow(old: Tracks, new: Tracks) -> tuple[list[tuple[float, ...]], set[tuple[f
         now[i] = (at, True)
     out = []
     for i, (k, fresh) in sorted(now.items()):
-        at = np.flatnonzero(old.id == i)
+        there = np.flatnonzero(old.id == i)
         if not fresh:
             link = float(old.link[k])
         else:
-            link = float(old.link[at[0]]) if len(at) and old.origin[at[0]] == new.origin[k] else 0.0
+            link = float(old.link[there[0]]) if len(there) and old.origin[there[0]] == new.origin[k] else 0.0
         out.append((*(new if fresh else old).mean[:, k].tolist(), link))
     return out, pairs
 
