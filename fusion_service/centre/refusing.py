@@ -7,21 +7,35 @@ centre does not fuse), length, bad-info, too-many-tracks, too-many-sources.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from typing import Protocol
 
 from fusion_service.centre.clock import horizon
 from fusion_service.centre.pictures import as_scan, is_own, source_of
 from fusion_service.centre.scans import fits, is_sound
-from schemas import LocalIntensity, LocalTracks, Message, SensorInfo, check_source
-
-if TYPE_CHECKING:
-    from fusion_service.centre.intake import Intake
-    from fusion_service.centre.sources import Source
+from fusion_service.centre.sources import Source
+from fusion_service.config import CentreConfig
+from schemas import Frame, LocalIntensity, LocalTracks, Message, SensorInfo, check_source
 
 __all__ = ["fault", "would_refuse"]
 
 
-def fault(intake: Intake, source: Source, message: Message, code: int, time: int, last: int, received: int) -> str:
+class Known(Protocol):
+    """What of an `Intake` decides."""
+
+    @property
+    def config(self) -> CentreConfig: ...
+    @property
+    def frame(self) -> Frame | None: ...
+    @property
+    def sources(self) -> Mapping[str, Source]: ...
+    @property
+    def is_full(self) -> bool: ...
+    def blank(self, name: str) -> Source: ...
+    def is_stale(self, source: Source, time: int) -> bool: ...
+
+
+def fault(intake: Known, source: Source, message: Message, code: int, time: int, last: int, received: int) -> str:
     """Why `message` of the digest `code`, received at `received`, is refused in the step at `time` after one at `last`,
     ns; empty where it is not."""
     config = intake.config
@@ -52,7 +66,7 @@ def fault(intake: Intake, source: Source, message: Message, code: int, time: int
     return "" if fits(message) else "length"
 
 
-def would_refuse(intake: Intake, event: Message, code: int, received: int, last: int) -> bool:
+def would_refuse(intake: Known, event: Message, code: int, received: int, last: int) -> bool:
     """Whether a message of the digest `code` would be refused in the next step after one at `last`, ns."""
     name = source_of(event)
     try:
