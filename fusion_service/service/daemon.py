@@ -283,5 +283,7 @@ class Service:
             skipped=self._times.skipped,
             overload=None if self._overload.since is None else time.monotonic() - self._overload.since,
         )
+        if self._overload.since is not None and status.notes:
+            self._told.warn("%s", status.notes[0])
         self._out["status"].put(encode(status))
         return status

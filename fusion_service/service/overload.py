@@ -29,22 +29,25 @@ Item = TypeVar("Item")
 
 class Overload:
     """Whether the service is behind. patience: seconds that what came may wait for its turn; infinite: only steps that
-    were skipped tell."""
+    were skipped tell. One that was is a hiccup; skipping again within `HOLD` is not."""
 
     def __init__(self, patience: float) -> None:
         self._patience = max(patience, LEAST)
         self._until = float("-inf")
         self._skipped = 0
+        self._skipped_at = float("-inf")
         self.since: float | None = None
         """When it began, s; None while there is none."""
 
     def look(self, now: float, waited: float, skipped: int) -> bool:
         """Whether it is behind at `now`, s: what waits has waited for `waited` s, `skipped` steps were skipped since
         the start."""
-        if waited > self._patience or skipped > self._skipped:
+        again = skipped > self._skipped and now - self._skipped_at < HOLD
+        if skipped > self._skipped:
+            self._skipped, self._skipped_at = skipped, now
+        if waited > self._patience or again:
             self._until = now + HOLD
             self.since = now if self.since is None else self.since
-        self._skipped = skipped
         if now >= self._until:
             self.since = None
         return self.since is not None

@@ -112,6 +112,9 @@ class Scene:
     def service(self, centre: str = "") -> Program:
         config = self.folder / "centre.toml"
         config.write_text(CONFIG.format(centre=centre, endpoint=self.endpoint, state=self.folder / "state"))
+        return self.run(config)
+
+    def run(self, config: Path) -> Program:
         return self.start(COMMAND, "run", "--config", str(config))
 
     def sensor(self, name: str, *targets: int, order: str = "given") -> Program:

@@ -81,8 +81,10 @@ def test_it_is_behind_while_there_are_signs_of_it_and_a_second_longer() -> None:
     assert one.since == 1.0
     assert one.look(1.0 + 0.9 * HOLD, 0.0, 0)
     assert not one.look(1.0 + HOLD, 0.0, 0)
-    assert one.look(10.0, 0.0, 1)
-    assert not one.look(10.0 + HOLD, 0.0, 1)
+    assert not one.look(10.0, 0.0, 1)
+    assert one.look(10.5, 0.0, 2)
+    assert one.look(10.4 + HOLD, 0.0, 2)
+    assert not one.look(10.5 + HOLD, 0.0, 2)
     assert not Overload(float("inf")).look(0.0, 1e6, 0)
 
 
