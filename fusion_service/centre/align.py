@@ -14,8 +14,9 @@ from fusion_service.arrays import Floats
 from fusion_service.centre import kinship
 from fusion_service.centre.evidence import chi2_by_size
 from fusion_service.centre.extents import with_reference
-from fusion_service.centre.intake import MAX_TOTAL, Intake
+from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.limits import MAX_TOTAL
 from fusion_service.centre.partial import Unknown, predict_known
 from fusion_service.centre.retiring import leave_out, retire
 from fusion_service.centre.rows import Rows

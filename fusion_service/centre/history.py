@@ -20,7 +20,8 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from fusion_service.centre.events import Event, SourceFound, SourceLost
-from fusion_service.centre.intake import MAX_ORDERS, MAX_SOURCES, Intake
+from fusion_service.centre.intake import Intake
+from fusion_service.centre.limits import MAX_ORDERS, MAX_SOURCES
 from fusion_service.centre.pictures import as_scan, source_of
 from fusion_service.centre.refusing import fault
 from fusion_service.centre.scans import size_of

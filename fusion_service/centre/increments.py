@@ -65,7 +65,7 @@ def increments(versions: Versions) -> Increments:
     out = Increments(
         np.empty((n, n, count)), np.empty((n, count)), np.empty(count), np.empty(count), np.empty(count, dtype=np.bool_)
     )
-    for part in linalg.blocks(n, count, 4):
+    for part in linalg.blocks(n, count):
         for one, column in zip(fields(out), _of_block(versions.take(part)), strict=True):
             getattr(out, one.name)[..., part] = column
     return out

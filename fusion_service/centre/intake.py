@@ -22,6 +22,15 @@ from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name
 from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, silence
 from fusion_service.centre.journal import Journal
+from fusion_service.centre.limits import (
+    MAX_COMPONENTS,
+    MAX_EVENTS,
+    MAX_ORDERS,
+    MAX_QUEUED,
+    MAX_SOURCES,
+    MAX_TOTAL,
+    MAX_TRACKS,
+)
 from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.pictures import as_scan, is_picture_of, source_of
@@ -51,16 +60,7 @@ from schemas import (
     digest,
 )
 
-__all__ = ["MAX_ORDERS", "MAX_SOURCES", "MAX_TOTAL", "Intake"]
-
-MAX_SOURCES = 1000
-MAX_TRACKS = 20_000
-MAX_TOTAL = 50_000
-MAX_QUEUED = 50_000
-MAX_COMPONENTS = 500_000
-MAX_EVENTS = 10_000
-MAX_ORDERS = 1000
-"""Orders of one step."""
+__all__ = ["Intake"]
 
 _Queued: TypeAlias = tuple[Message, int]
 _Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]

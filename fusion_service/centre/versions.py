@@ -9,16 +9,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
-from typing import Any, cast
+from itertools import groupby
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Floats, Ints, find_sorted
 from fusion_service.centre.align import predict_tracks
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import Rows
-from fusion_service.centre.tracks import Pair, Tracks, join_tracks, taken
+from fusion_service.centre.tracks import Tracks, join_tracks, taken
 from fusion_service.centre.treatment import Treatment
 from schemas import Motion
 
@@ -52,28 +53,73 @@ def versions_of(intake: Intake, rows: Rows, time: int) -> Versions:
     """All versions that came in with the step at `time`, ns, of rows that are used in it; none is later, whatever the
     clock of its source was thought to be when it came."""
     n = len(intake.config.space)
-    parts = [part for name, part in _by_source(intake, rows, time) if len(part.row)]
+    parts = [_predicted([*run], intake, time) for _, run in groupby(_by_source(intake, rows), key=_alike)]
     if not parts:
         none, whole = np.zeros((n, 0)), np.zeros(0, dtype=np.int64)
         return Versions(np.zeros(0, dtype=np.intp), whole, whole, none, np.zeros((n, n, 0)), none, np.zeros((n, n, 0)))
-    joined = Versions(
-        *(np.concatenate([getattr(part, one.name) for part in parts], axis=-1) for one in fields(Versions))
-    )
+    joined = parts[0] if len(parts) == 1 else _joined(parts)
     later, same = joined.time[1:] > joined.time[:-1], joined.time[1:] == joined.time[:-1]
     if (later | same & (joined.row[1:] >= joined.row[:-1])).all():
         return joined
     return joined.take(np.lexsort((joined.row, joined.time)))
 
 
-def _by_source(intake: Intake, rows: Rows, time: int) -> Iterator[tuple[str, Versions]]:
+class _Part(NamedTuple):
+    """What is new of a source: the old versions and the new ones, of rows `at`; how they move, in which space, what
+    they were inflated by, and how they are treated."""
+
+    old: _Densities
+    new: _Densities
+    at: Ints
+    motion: Motion
+    space: tuple[str, ...]
+    inflation: float
+    treatment: Treatment
+
+
+def _alike(part: _Part) -> tuple[Any, ...]:
+    """What parts that are predicted together have in common; of one whose states are corrected it is all its own."""
+    alone = -1 if part.treatment.correction is None else int(part.at[0])
+    return (
+        part.motion,
+        part.space,
+        part.inflation,
+        part.treatment.clock,
+        alone,
+        len(part.old.log_weight),
+        len(part.new.log_weight),
+    )
+
+
+def _by_source(intake: Intake, rows: Rows) -> Iterator[_Part]:
     start = 0
     for name, count in rows.kept.items():
         source, ids = intake.sources[name], rows.tracks.id[start : start + count]
         if source.pairs and count:
+            old, new = (_densities([pair[side] for pair in source.pairs]) for side in (0, 1))
+            at = np.minimum(find_sorted(ids, new.id), count - 1)
+            known = ids[at] == new.id
+            old, new, at = _thinned(old.take(known), new.take(known), at[known])
             said = intake.declared(source)
-            part = _versions(source.pairs, said.motion, said.inflation, source.space, intake, ids, start)
-            yield name, _registered(part, intake.treatment(name), time)
+            if len(at):
+                part = at + start, said.motion, source.space, said.inflation, intake.treatment(name)
+                yield _Part(old, new, *part)
         start += count
+
+
+def _predicted(parts: list[_Part], intake: Intake, latest: int) -> Versions:
+    """The versions of parts that are alike."""
+    first, wanted = parts[0], intake.config.space
+    old, new = (
+        _together([_as_said(side, first.inflation) for side in sides])
+        for sides in zip(*(part[:2] for part in parts), strict=True)
+    )
+    gone, speed = (new.time - old.time) / 1e9, intake.config.unknown_speed
+    before = predict_tracks(old, first.motion, first.space, wanted, gone, intake.frame, speed)
+    now = predict_tracks(new, first.motion, first.space, wanted, np.zeros(len(new.time)), intake.frame)
+    at = np.concatenate([part.at for part in parts])
+    versions = Versions(at, new.time, old.time, before.mean, before.covariance, now.mean, now.covariance)
+    return _registered(versions, first.treatment, latest)
 
 
 def _registered(versions: Versions, treatment: Treatment, latest: int) -> Versions:
@@ -87,25 +133,6 @@ def _registered(versions: Versions, treatment: Treatment, latest: int) -> Versio
     old = treatment.correction.moved(versions.predicted_mean, versions.predicted_covariance)
     new = treatment.correction.moved(versions.mean, versions.covariance)
     return Versions(versions.row, versions.time, versions.before, *old, *new)
-
-
-def _versions(
-    pairs: list[Pair], motion: Motion, inflation: float, space: tuple[str, ...], intake: Intake, ids: Any, start: int
-) -> Versions:
-    """Those of one source, whose rows have these ids (sorted), the first of them being row `start`."""
-    old, new = (_densities([pair[side] for pair in pairs]) for side in (0, 1))
-    if len(ids) == len(new.id) and (ids == new.id).all():
-        at = np.arange(len(ids))
-    else:
-        at = np.minimum(np.searchsorted(ids, new.id), len(ids) - 1)
-        known = ids[at] == new.id
-        old, new, at = _thinned(old.take(known), new.take(known), at[known])
-    old, new = _as_said(old, inflation), _as_said(new, inflation)
-    wanted = intake.config.space
-    gone, speed = (new.time - old.time) / 1e9, intake.config.unknown_speed
-    predicted = predict_tracks(old, motion, space, wanted, gone, intake.frame, speed)
-    now = predict_tracks(new, motion, space, wanted, np.zeros(len(new.time)), intake.frame)
-    return Versions(at + start, new.time, old.time, predicted.mean, predicted.covariance, now.mean, now.covariance)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,8 +154,15 @@ class _Densities:
 
 def _densities(parts: list[Tracks]) -> _Densities:
     """One after the other."""
-    some = [_Densities(*(getattr(part, one.name) for one in fields(_Densities))) for part in parts]
-    return some[0] if len(some) == 1 else join_tracks(some)
+    return _together([_Densities(*(getattr(part, one.name) for one in fields(_Densities))) for part in parts])
+
+
+def _together(parts: list[_Densities]) -> _Densities:
+    return parts[0] if len(parts) == 1 else join_tracks(parts)
+
+
+def _joined(parts: list[Versions]) -> Versions:
+    return Versions(*(np.concatenate([getattr(part, one.name) for part in parts], axis=-1) for one in fields(Versions)))
 
 
 def _thinned(old: _Densities, new: _Densities, at: Any) -> tuple[_Densities, _Densities, Any]:

@@ -205,7 +205,8 @@ def test_intervals_and_what_is_remembered_are_in_the_checkpoint(cut: int) -> Non
     assert fed(result) == {1, 3}
 
 
-def test_many_ids_that_come_and_go_are_remembered_within_bounds() -> None:
+def test_many_ids_that_come_and_go_are_remembered_within_bounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fusion_service.centre.align.MAX_TOTAL", 50_000)
     made = centre((), lateness=0.0, stale_periods=1.0)
     made.handle(info("r1"), START)
     rng = np.random.default_rng(2)
