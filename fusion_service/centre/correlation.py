@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, picked
 from fusion_service.centre.derived import MOST_MEMBERS, Followed
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.kept_weights import KeptWeights
@@ -170,9 +170,10 @@ def _part(
     N, n, size = means.shape
     whole = Fused(*(np.full((*shape, size), np.nan) for shape in ((n,), (n, n), (N,), (N,))))
     if some.any():
-        options |= {name: options[name][..., some] for name in EACH if name in options}
-        begin = None if start is None else start[:, some]
-        part = fuse_last(rule, means[..., some], covariances[..., some], influence=True, start=begin, **options)
+        options |= {name: picked(options[name], some) for name in EACH if name in options}
+        begin = None if start is None else picked(start, some)
+        x, P = picked(means, some), picked(covariances, some)
+        part = fuse_last(rule, x, P, influence=True, start=begin, **options)
         for column, wide in zip(_columns(part), _columns(whole), strict=True):
             wide[..., some] = column
     return whole
