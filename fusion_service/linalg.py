@@ -125,8 +125,8 @@ def _pieces(P: Floats, out: Floats | None = None) -> Iterator[tuple[Floats, Floa
 
 
 def _diagonal(P: Floats) -> Floats:
-    """A view, (n, B)."""
-    return np.moveaxis(P.diagonal(), -1, 0)
+    """A view, (n, B), of (n, n, B)."""
+    return P.diagonal().T
 
 
 def _factor(P: Floats, W: Floats, det: Floats | None = None) -> None:

@@ -20,6 +20,7 @@ An element's result is the same, bit for bit, whatever batch surrounds it.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from math import factorial
 
 import numpy as np
@@ -36,6 +37,7 @@ AXES = (("x", "vx", "ax"), ("y", "vy", "ay"), ("z", "vz", "az"))
 SMALL_GAP = 1.0
 """Below this multiple of tau the moments of what is forgotten come from their series, of `TERMS` terms."""
 TERMS = 22
+BACK = "a state is never predicted back in time: dt must be 0 or more seconds"
 
 
 def predict(
@@ -55,11 +57,8 @@ def predict(
     if not np.any(dt):
         return means.copy(), covariances.copy()
     turning = motion.kind == "ct" and turns(space, frame)
-    # one F and Q for all where all go as far: the same bits
     once = not turning and dt.ndim == 1 and bool((dt == dt[0]).all())
-    moves, noise = transition(motion, space, means[:, :1] if once else means, dt[:1] if once else dt, frame)
-    if once:
-        moves = moves[..., 0]
+    moves, noise = _at_once(motion, space, float(dt[0])) if once else transition(motion, space, means, dt, frame)
     with np.errstate(all="ignore"):
         if turning:
             w = space.index("turn_rate")
@@ -74,6 +73,16 @@ def predict(
         return predicted, spread
     same = dt == 0
     return np.where(same, means, predicted), np.where(same, covariances, spread)
+
+
+@lru_cache(maxsize=256)
+def _at_once(motion: Motion, space: tuple[str, ...], dt: float) -> tuple[Floats, Floats]:
+    """F (n, n) and Q (n, n, 1) of a gap that all have in common: the same bits as each alone. Not of a turn."""
+    if not dt >= 0:
+        raise ValueError(BACK)
+    with np.errstate(all="ignore"):
+        moves, noise = _kinematics(motion, space, np.array([dt]))
+    return moves[..., 0], noise
 
 
 def transition(
@@ -94,7 +103,7 @@ def transition(
     In every kind q_turn dt is added on a turn rate. Raises ValueError for a negative or NaN `dt`.
     """
     if not np.all(dt >= 0):
-        raise ValueError("a state is never predicted back in time: dt must be 0 or more seconds")
+        raise ValueError(BACK)
     with np.errstate(all="ignore"):
         moves, noise = _kinematics(motion, space, np.ascontiguousarray(dt))
         if motion.kind == "ct" and turns(space, frame):

@@ -9,7 +9,7 @@ the batch, so that a message gets the same codes alone and among others.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import accumulate, pairwise
 from typing import TypeAlias
 
@@ -48,18 +48,34 @@ def check_numbers(messages: Sequence[Densities]) -> list[Codes]:
     for index, message in enumerate(messages):
         by_dimension.setdefault(message.means.shape[1], []).append(index)
     with np.errstate(all="ignore"):
-        for indices in by_dimension.values():
-            means = [messages[index].means for index in indices]
-            codes = _density_faults(
-                np.concatenate(means), np.concatenate([messages[index].covariances for index in indices])
-            )
-            ends = accumulate(map(len, means), initial=0)
-            for index, (low, high) in zip(indices, pairwise(ends), strict=True):
-                faults[index] = codes[low:high]
+        for together in by_dimension.values():
+            for indices in _batches(together, messages):
+                means, covariances = _one(messages, indices, "means"), _one(messages, indices, "covariances")
+                codes = _density_faults(means, covariances)
+                ends = accumulate((len(messages[index].means) for index in indices), initial=0)
+                for index, (low, high) in zip(indices, pairwise(ends), strict=True):
+                    faults[index] = codes[low:high]
         _weight_faults(messages, faults)
         _existence_faults(messages, faults)
         _extent_faults(messages, faults)
     return faults
+
+
+def _batches(indices: list[int], messages: Sequence[Densities]) -> Iterator[list[int]]:
+    """Messages that fill a block alone, each as it is; the small ones together."""
+    small = []
+    for index in indices:
+        if len(messages[index].means) >= BLOCK:
+            yield [index]
+        else:
+            small.append(index)
+    if small:
+        yield small
+
+
+def _one(messages: Sequence[Densities], indices: list[int], name: str) -> Floats:
+    columns: list[Floats] = [getattr(messages[index], name) for index in indices]
+    return columns[0] if len(columns) == 1 else np.concatenate(columns)
 
 
 def _density_faults(means: Floats, covariances: Floats) -> Codes:

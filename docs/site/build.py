@@ -28,7 +28,17 @@ ELSEWHERE = {
 """Pages that are not below docs/: path in the repository, name in the site."""
 SECTIONS = {
     "Use it": [
-        *("tutorial", "operating", "judgement", "supervision", "registration", "conduct", "platforms", "extent"),
+        *(
+            "tutorial",
+            "operating",
+            "arrival",
+            "judgement",
+            "supervision",
+            "registration",
+            "conduct",
+            "platforms",
+            "extent",
+        ),
         *("tracklets", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "rules-speed"],

@@ -22,6 +22,7 @@ from fusion_service.densities import Mixtures, log_sum
 
 __all__ = [
     "CROWDED",
+    "SOUND",
     "by_size",
     "candidate_pairs",
     "cluster",

@@ -12,6 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Iterable, Mapping
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,7 +24,7 @@ from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
 from fusion_service.centre.deltas import Deltas, fed
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
-from fusion_service.centre.events import Event, Skipped
+from fusion_service.centre.events import Event, Refused, Skipped
 from fusion_service.centre.history import History, Past
 from fusion_service.centre.ids import Ids
 from fusion_service.centre.intake import Intake
@@ -82,6 +83,7 @@ class Centre(ABC):
         self._history = History(self.config)
         self._ids.book = Book() if self._history.on else None
         self._state: bytes | None = None
+        self._other: dict[int, int] = {}
         self._step = 0
         self._published = 0
         self._time = -1
@@ -163,8 +165,11 @@ class Centre(ABC):
         journal = self._journal
         self._obey(self._intake.take_orders(), time)
         self._forget_lineages()
+        told = len(journal.taken())  # of what was late
         self._intake.admit(time, self._time, journal)
-        self._history.add(past, self._intake.raw, journal.taken(), owes=events is None)
+        if events is None:
+            past.events += tuple((Refused(name, "queue", 1, True), time) for name in sorted(self._intake.spared.newest))
+        self._history.add(past, self._intake.raw, journal.taken()[told:], owes=events is None)
         self._time = time
         if self._intake.reframed:
             self._intake.reframed = False
@@ -173,13 +178,14 @@ class Centre(ABC):
         names = self._intake.names()
         journal.name_sources(names)
         contributions = self._advance(rows, names, time)
-        gone_on = heirs(journal.ended())
+        gone_on = {**heirs(journal.ended()), **self._other}
+        self._other = {}
         self._intake.orders.follow(gone_on)
         self._labels.follow(rows, self._picture, names, gone_on, time, journal)
         return contributions
 
     def _begin_step(self, time: int, events: tuple[tuple[Event, int], ...], left: int) -> Past:
-        past = Past(self._step + 1, time, self._time, events)
+        past = Past(self._step + 1, time, self._time, events, copy(self._intake.spared))
         if self._history.on:
             rows = len(self._picture.id) + sum(len(one.tracks.id) for one in self._intake.sources.values())
             kept = self._history.keeps(self._time, past.number, rows, left)
@@ -211,15 +217,26 @@ class Centre(ABC):
         self._journal = own
         revision.finish(self._intake, queue)
         if self._ids.book is not None:
-            self._ids.book.done()
-        return revision.tell(own, self._intake, self._picture.id)
+            there = revision.there.union(one for one in self._picture.id.tolist() if one >= revision.following)
+            self._go_on_as(self._ids.book.done(self._picture.id.tolist(), there, self._ids.fresh))
+        return revision.tell(own, self._intake, self._picture.id, self._other)
+
+    def _go_on_as(self, new: dict[int, int]) -> None:
+        """Tracks that have ended, and are there after all, take other ids: {old: new}."""
+        self._other = new
+        if new:
+            ids = np.array([new.get(one, one) for one in self._picture.id.tolist()], dtype=np.uint64)
+            self._picture = replace(self._picture, id=ids).take(np.argsort(ids))
+            self._renamed(new)
+            self._intake.orders.follow(new)
 
     def _go_back(self, revision: Revision) -> None:
         """To the state before the first of the steps to be made again. Ids go on, and eras."""
         if self._ids.book is not None:
-            self._ids.book.again(revision.steps[0].number - 1, revision.tables)
+            self._ids.book.again(revision.steps[0].number - 1, revision.tables, revision.there)
         state = revision.steps[0].state
         self._intake = Intake(self.config)
+        self._intake.spared = copy(revision.steps[0].spared)
         self._labels = Labels(self._intake)
         self._begin()
         kept, self._picture = unpack_state(state or b"", self._intake, self._labels)
@@ -239,6 +256,13 @@ class Centre(ABC):
     def view(self) -> View:
         """What orders are judged by now, as it is: no copy that later steps leave alone."""
         return view_of(self._intake, self._picture, self._time)
+
+    def let_go(self, tracks: NDArray[np.uint64]) -> int:
+        """Forget global tracks that have ended since the checkpoint that this centre was made from; how many it had."""
+        gone = np.isin(self._picture.id, tracks)
+        self._forget(self._picture.id[gone].tolist())
+        self._picture = self._picture.take(~gone)
+        return int(gone.sum())
 
     def checkpoint(self) -> bytes:
         """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""
@@ -274,6 +298,10 @@ class Centre(ABC):
     def _rebase(self, time: int) -> None:
         """A new era begins at `time`, ns: nothing that this kind has of its own is later."""
 
+    @abstractmethod
+    def _renamed(self, new: dict[int, int]) -> None:
+        """Tracks of the picture have other ids now: {old: new}."""
+
     @property
     @abstractmethod
     def _rule(self) -> str:
@@ -299,11 +327,9 @@ class Centre(ABC):
 
     def _end_all(self, tracks: NDArray[np.uint64], reason: str) -> None:
         """End those of these global tracks that there are."""
-        gone = np.isin(self._picture.id, tracks)
-        for track in self._picture.id[gone].tolist():
+        for track in self._picture.id[np.isin(self._picture.id, tracks)].tolist():
             self._journal.end(track, reason, None)
-        self._forget(self._picture.id[gone].tolist())
-        self._picture = self._picture.take(~gone)
+        self.let_go(tracks)
 
     def _forget_lineages(self) -> None:
         """Let go the lineages that nothing has any more, where they are many."""

@@ -120,7 +120,7 @@ def _restore_words(whole: dict[str, Any], sources: dict[str, Source], intake: In
 def _pack_source(source: Source) -> dict[str, Any]:
     packed = {name: getattr(source, name) for name in _PLAIN}
     packed["space"] = list(source.space)
-    packed["seen"] = [list(key) for key in source.seen]
+    packed["seen"] = [*source.seen]
     packed["info"] = None if source.info is None else encode(source.info)
     packed["tracks"] = _pack_columns(source.tracks)
     packed["remembered"] = [to_bytes(column) for column in source.remembered]
@@ -165,7 +165,8 @@ def _unpack_place(packed: list[Any]) -> Place:
 def _pack_columns(columns: Tracks | Picture) -> dict[str, Any]:
     packed: dict[str, Any] = {"components": len(columns.log_weight)}
     for one in fields(columns):
-        packed[one.name] = to_bytes(getattr(columns, one.name))
+        column = getattr(columns, one.name)
+        packed[one.name] = np.ascontiguousarray(column, column.dtype.newbyteorder("<")).data  # packed uncopied
     return packed
 
 

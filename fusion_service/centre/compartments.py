@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import find_sorted
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import Source
@@ -76,15 +77,14 @@ class Compartments:
         if not len(ids) or (plain and not self._intake.orders.about("quarantine")):
             return origin, apart
         if len(self.track):
-            at = np.minimum(np.searchsorted(self.track, ids), len(self.track) - 1)
+            at = np.minimum(find_sorted(self.track, ids), len(self.track) - 1)
             known = self.track[at] == ids
             origin[known], apart[known] = self.origin[at[known]], self.apart[at[known]]
         link = rows.tracks.link
-        at = np.minimum(np.searchsorted(ids, link), len(ids) - 1)
+        at = np.minimum(find_sorted(ids, link), len(ids) - 1)
         linked = np.flatnonzero((link != NO_TRACK) & (ids[at] == link))
         at = at[linked]
-        fed = np.unique(at)
-        origin[fed], apart[fed] = 0, np.iinfo(np.int32).max
+        origin[at], apart[at] = 0, np.iinfo(np.int32).max
         np.maximum.at(origin, at, rows.tracks.origin[linked])
         np.minimum.at(apart, at, self._rows_apart(rows, names)[linked])
         return origin, apart

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints, picked
+from fusion_service.centre.association import SOUND as SOUND_ALONE
 from fusion_service.centre.association import by_size, uniform_ci
+from fusion_service.compiled.either import FAST
 
 __all__ = ["Consensus", "consensus"]
 
@@ -45,12 +47,16 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
     partner = np.full(count, -1)
     size = np.ones(count, dtype=np.intp)
     more: list[tuple[Ints, Floats, Floats]] = []
+    others = np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
     for names, rows in by_size(labels):
         at = np.searchsorted(unique, names)
         k = rows.shape[1]
         size[rows] = k
         if k == 1:
             mean[:, at], covariance[:, :, at] = picked(means, rows[:, 0]), picked(covariances, rows[:, 0])
+            continue
+        if "intersect" in FAST:
+            mean[:, at], covariance[:, :, at] = _compiled(rows, means, covariances, *others)
             continue
         columns = [rows[:, j] for j in range(k)]
         xs, Ps = [picked(means, one) for one in columns], [picked(covariances, one) for one in columns]
@@ -62,14 +68,39 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
         mean[:, at], covariance[:, :, at] = whole
         more += [(one, *other) for one, other in zip(columns, without, strict=True)]
     paired = np.flatnonzero(partner >= 0)
-    others = picked(means, partner), picked(covariances, partner)
-    if len(paired) < count:
-        alone = np.flatnonzero(partner < 0)
-        others[0][:, alone], others[1][:, :, alone] = np.nan, np.nan
+    if len(paired) == count:
+        others = picked(means, partner), picked(covariances, partner)
+    elif len(paired):
+        others[0][:, paired], others[1][:, :, paired] = means[:, partner[paired]], covariances[:, :, partner[paired]]
     for one, x, P in more:
         others[0][:, one], others[1][:, :, one] = x, P
-    others_mean, others_covariance = others
-    return Consensus(unique, mean, covariance, others_mean, others_covariance, size)
+    return Consensus(unique, mean, covariance, *others, size)
+
+
+def _compiled(
+    rows: Ints, means: Floats, covariances: Floats, others_mean: Floats, others_covariance: Floats
+) -> tuple[Floats, Floats]:
+    """Mean (n, G) and covariance (n, n, G) of groups `rows` (G, k), k >= 2, by the compiled kernel; those of the others
+    of each row are written into the last two."""
+    k = rows.shape[1]
+    x, P, margin, beside = FAST["intersect"](means, covariances, rows, (others_mean, others_covariance))
+    bad = np.flatnonzero(~(margin > (SOUND_ALONE if k == 2 else SOUND)))
+    if len(bad):
+        x[:, bad], P[:, :, bad] = _of_groups(rows[bad], means, covariances)
+    for j in range(k if k > 2 else 0):
+        at = rows[~(beside[rows[:, j]] > SOUND)]
+        if len(at):
+            one = at[:, j]
+            others_mean[:, one], others_covariance[:, :, one] = _of_groups(np.delete(at, j, 1), means, covariances)
+    return x, P
+
+
+def _of_groups(rows: Ints, means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
+    """`uniform_ci` of groups (G, k)."""
+    return uniform_ci(
+        np.ascontiguousarray(np.moveaxis(means[:, rows], 2, 0)),
+        np.ascontiguousarray(np.moveaxis(covariances[:, :, rows], 3, 0)),
+    )
 
 
 def _all_but_one(xs: list[Floats], Ps: list[Floats]) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:

@@ -86,11 +86,11 @@ class Correlation:
 
     def _start(self, rows: Rows, members: Ints) -> Floats | None:
         """The weights (N, B) of the last step."""
-        return None if self.kept is None else self.kept.of(rows.tracks.link[members[:, 0]], members.shape[1])
+        return None if self.kept is None else self.kept.of(rows.tracks.link[members[:, 0]], rows.source[members.T])
 
     def _note(self, rows: Rows, members: Ints, weights: Floats) -> None:
         if self.kept is not None:
-            self.kept.note(rows.tracks.link[members[:, 0]], weights)
+            self.kept.note(rows.tracks.link[members[:, 0]], rows.source[members.T], weights)
 
     def _sure(
         self,
@@ -137,9 +137,10 @@ class Correlation:
         R, C, unknown = np.ones((N, N, size)), None, np.ones(size)
         if followed is not None:
             R, whole, unknown = followed.of(members)
-            C = whole[:, :, some][:, :, :, some]
+            C = whole if len(some) == whole.shape[2] else whole[:, :, some][:, :, :, some]
         derived = (R < 1.0).any(axis=(0, 1))
-        R = np.minimum(R, self._between(rows, members))
+        if self.groups is not None:
+            R = np.minimum(R, self._between(rows, members))
         bounded = (R < 1.0).any(axis=(0, 1))
         known = (unknown < ENOUGH) & (self.config.rule != "bci")
         exact = _part("bar-shalom-campo", means, covariances, known, cross_covariance=C)
@@ -148,9 +149,8 @@ class Correlation:
         under = _part("bci", means, covariances, bounded, start, max_correlation=R, **few)
         neither = ~known & ~bounded
         safe = _part("ci", means, covariances, neither, start, **few)
-        columns = zip(_columns(exact), _columns(under), _columns(safe), strict=True)
-        fused = Fused(*(np.where(known, a, np.where(bounded, b, c)) for a, b, c in columns))
-        self._note(rows, members, np.where(known, np.nan, fused.weights))
+        fused = _joined((known, exact), (bounded, under), (neither, safe))
+        self._note(rows, members, np.where(known, np.nan, fused.weights) if known.any() else fused.weights)
         way = np.where(known, BY_CROSS, np.where(bounded, np.where(derived, BY_DERIVED, BY_DECLARED), BY_CI))
         return fused, way.astype(np.uint8)
 
@@ -168,14 +168,27 @@ def _part(
 ) -> Fused:
     """The fusions of some elements, in a batch in which the others are NaN."""
     N, n, size = means.shape
+    at = np.flatnonzero(some)
+    if len(at) == size:
+        return fuse_last(rule, means, covariances, influence=True, start=start, **options)
     whole = Fused(*(np.full((*shape, size), np.nan) for shape in ((n,), (n, n), (N,), (N,))))
-    if some.any():
-        options |= {name: picked(options[name], some) for name in EACH if name in options}
-        begin = None if start is None else picked(start, some)
-        x, P = picked(means, some), picked(covariances, some)
+    if len(at):
+        options |= {name: picked(options[name], at) for name in EACH if name in options}
+        begin = None if start is None else picked(start, at)
+        x, P = picked(means, at), picked(covariances, at)
         part = fuse_last(rule, x, P, influence=True, start=begin, **options)
         for column, wide in zip(_columns(part), _columns(whole), strict=True):
-            wide[..., some] = column
+            wide[..., at] = column
+    return whole
+
+
+def _joined(*parts: tuple[Bools, Fused]) -> Fused:
+    """One batch of `_part`s, each element of the one whose mask it is in."""
+    there = [(some, part) for some, part in parts if some.any()] or list(parts[:1])
+    whole = there[0][1]
+    for some, part in there[1:]:
+        columns = zip(_columns(whole), _columns(part), strict=True)
+        whole = Fused(*(np.where(some, new, old) for old, new in columns))
     return whole
 
 

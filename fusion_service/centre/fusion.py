@@ -78,6 +78,9 @@ class FusionCentre(Centre):
         self._supervisor.rebase(time)
         self._last = min(self._last, time)
 
+    def _renamed(self, new: dict[int, int]) -> None:
+        self._relink(new)
+
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         now = self._associate(rows, names, time)
         self._supervisor.observe(rows, names, now, self._step, time, self._journal, self._own())

@@ -23,6 +23,7 @@ from fusion_service.centre.intake import MAX_ORDERS, MAX_SOURCES, Intake
 from fusion_service.centre.pictures import source_of
 from fusion_service.centre.refusing import would_refuse
 from fusion_service.centre.scans import size_of
+from fusion_service.centre.spared import Spared
 from fusion_service.config import CentreConfig
 from fusion_service.order import Order
 from schemas import Entry, GlobalTracks, LocalIntensity, LocalTracks, Message, MessageError, Status, digest
@@ -35,6 +36,8 @@ MOST_ROWS = 1_000_000
 """Tracks, local and global, in all kept states together; above that there are fewer states, but two at least."""
 RECENT = 3
 """Newest states that are kept while data come late."""
+JUST = 1_000_000
+"""ns: on arrival, a scan of that much before the newest step belongs to it as much as to one of its own."""
 BUSY = 20
 """Steps for which they are kept after the last late message."""
 MOST_STEPS = 2000
@@ -59,12 +62,14 @@ class Late:
 @dataclass(slots=True, eq=False)
 class Past:
     """A step that was made: its time and that of the one before it, ns; events and messages that went into it, with
-    when they came; state: the checkpoint before it, lasting: as one of the few that are kept for long."""
+    when they came; spared: whose silence said nothing before it; state: the checkpoint before it, lasting: as one of
+    the few that are kept for long."""
 
     number: int
     time: int
     before: int
     events: tuple[tuple[Event, int], ...]
+    spared: Spared
     inputs: list[tuple[Message, int]] = field(default_factory=list)
     state: bytes | None = None
     lasting: bool = False
@@ -77,15 +82,17 @@ def key_of(entry: Entry) -> Key:
 
 
 class History:
-    """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source;
-    revised: steps made again since the start."""
+    """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source,
+    and reordered, those of them that came after a later one; revised: steps made again since the start."""
 
     def __init__(self, config: CentreConfig) -> None:
         self._lateness = round(config.lateness * 1e9)
         self._pace = config.revise
+        self._just = JUST if config.trigger == "arrival" else 0
         self.on = self._pace > 0 and self._lateness > 0
         self.past: list[Past] = []
         self.late: Counter[str] = Counter()
+        self.reordered: Counter[str] = Counter()
         self.revised = 0
         self._credit = 0.0
         self._busy = 0
@@ -126,7 +133,7 @@ class History:
             if not isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks)):
                 continue
             due = event.time - intake.treatment(source_of(event)).clock
-            if due > last or event.time < last - self._lateness:
+            if due > last - self._just or event.time < last - self._lateness:
                 continue
             try:
                 code = digest(event)
@@ -196,7 +203,10 @@ class History:
         if not self.late:
             return status
         queue = dict(status.queue) | {"late": self.late.total(), "revised": self.revised}
-        sources = {name: entry | {"late": self.late[name]} for name, entry in status.sources.items()}
+        sources = {
+            name: entry | {"late": self.late[name], "reordered": entry["reordered"] + self.reordered[name]}
+            for name, entry in status.sources.items()
+        }
         return replace(status, queue=queue, sources=sources)
 
     def add(self, one: Past, raw: dict[Key, tuple[Message, int, int]], taken: Iterable[Entry], owes: bool) -> None:
@@ -220,7 +230,7 @@ class History:
         self._trim(one.time - self._lateness)
 
     def _owe(self, key: Key, due: int, before: int) -> None:
-        if before >= 0 and due <= before and len(self._owed) < MOST_OWED:
+        if before >= 0 and due <= before - self._just and len(self._owed) < MOST_OWED:
             self._owed[key] = due
 
     def _trim(self, oldest: int) -> None:

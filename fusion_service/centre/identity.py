@@ -58,9 +58,11 @@ class Identities:
     def follow(self, rows: Rows, ids: Ids, heirs: Mapping[int, int]) -> None:
         """After a step: hear what the linked rows say that is new, and forget tracks that are no more. ids: of the
         picture, sorted; heirs: {id that ended: id that goes on for it}. Writes `told` of rows and tables."""
-        self.identity, self.kind = (_inherited(one, heirs) for one in (self.identity, self.kind))
         tracks = rows.tracks
         says = (tracks.identity != NONE) | (tracks.kind != NONE)
+        if not (says.any() or len(self.identity.track) or len(self.kind.track) or self.ordered()):
+            return
+        self.identity, self.kind = (_inherited(one, heirs) for one in (self.identity, self.kind))
         new = np.flatnonzero(says & (tracks.link != NO_TRACK) & ~tracks.outside & (tracks.updated > tracks.told))
         new = new[np.isin(tracks.link[new], ids)]
         known = np.concatenate([self.identity.track, self.kind.track])
@@ -202,7 +204,8 @@ class Identities:
     def _trusted(self, rows: Rows, some: Ints) -> tuple[Ints, Codes, Codes]:
         """Of some rows those that have an identity from a source that is trusted, in order, and each its question and
         its answer."""
-        some = np.unique(some[rows.tracks.identity[some] != NONE])
+        some = some[rows.tracks.identity[some] != NONE]
+        some = np.unique(some) if len(some) else some
         if len(some):
             some = some[self._stated("identity_trust", rows.source[some]) >= TRUSTED]
         code = rows.tracks.identity[some]

@@ -32,8 +32,9 @@ class Ids:
         if self.book is None or whom is None or not count:
             first, self.next = self.next, self.next + count
             return np.arange(first, self.next, dtype=np.uint64)
-        return np.array(self.book.allot(whom(), self._fresh), dtype=np.uint64)
+        return np.array(self.book.allot(whom(), self.fresh), dtype=np.uint64)
 
-    def _fresh(self, count: int) -> list[int]:
+    def fresh(self, count: int) -> list[int]:
+        """So many new ones."""
         first, self.next = self.next, self.next + count
         return list(range(first, self.next))

@@ -13,7 +13,7 @@ step; nothing that a message contains raises; all is bounded.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
+from dataclasses import fields, replace
 from typing import Any
 
 import numpy as np
@@ -92,6 +92,12 @@ class IntensityCentre(Centre):
 
     def _rebase(self, time: int) -> None:
         self._memory = replace(self._memory, supported=np.minimum(self._memory.supported, time))
+
+    def _renamed(self, new: dict[int, int]) -> None:
+        ids = np.array([new.get(one, one) for one in self._memory.id.tolist()], dtype=np.uint64)
+        order = np.argsort(ids)
+        columns = {one.name: getattr(self._memory, one.name)[order] for one in fields(self._memory)}
+        self._memory = Memory(**(columns | {"id": ids[order]}))
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
         new = self._news(names)

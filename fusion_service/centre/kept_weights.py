@@ -1,67 +1,127 @@
-"""The weights of the last step, for the next one to begin with.
+"""The weights of earlier steps, for the next one to begin with.
 
-Covariances change little from step to step, and so do the best weights of covariance intersection. Those of the last
-step are kept while their own certificate says that the criterion could be smaller by .1 % at most (`ci.KEPT`); else the
+Covariances change little from step to step, and so do the best weights of covariance intersection. Those that were last
+used are kept while their own certificate says that the criterion could be smaller by .1 % at most (`ci.KEPT`); else the
 best are sought anew, from nothing, so that what comes of it does not depend on how it was come by. Any weights give a
 conservative result: nothing that the rule promises depends on them.
 
-Of each global track that three rows or more feed, by its id: who they are need not be known, for whatever numbers stand
-here are tried by the certificate.
+Of each global track that three rows or more feed, by source. Where other sources feed it than the last time (a row
+failed its gate in a step, and is back in the next), the last weights of the same ones are found, else those of them
+that had any, brought to a sum of 1: whatever numbers stand here are tried by the certificate.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, from_bytes, to_bytes
+from fusion_service.arrays import Floats, Ints, from_bytes, to_bytes
 
-__all__ = ["KeptWeights"]
+__all__ = ["STEPS", "Ids", "KeptWeights"]
 
 Ids = NDArray[np.uint64]
 FEWEST = 3
 """Of two rows the best weights are found at once."""
+STEPS = 10
+"""Steps for which weights are kept that are not used."""
+ENOUGH = 0.5
+"""Of the weights that the sources now had then, below which they tell nothing."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Kept:
+    """Of G global tracks that N rows fed: id (G,), source (N, G) by its number, weight (N, G), age (G,) in steps."""
+
+    id: Ids
+    source: NDArray[np.int64]
+    weight: Floats
+    age: NDArray[np.int64]
+
+    def take(self, at: Any) -> _Kept:
+        return _Kept(*(getattr(self, one.name)[..., at] for one in fields(self)))
+
+    def join(self, *others: _Kept) -> _Kept:
+        parts = [self, *others]
+        return _Kept(*(np.concatenate([getattr(part, one.name) for part in parts], axis=-1) for one in fields(self)))
 
 
 class KeptWeights:
-    """Weights by number of rows N: ids (G,) in their order, weights (N, G)."""
+    """The weights, by the number of rows."""
 
     def __init__(self) -> None:
-        self._last: dict[int, tuple[Ids, Floats]] = {}
-        self._next: dict[int, list[tuple[Ids, Floats]]] = {}
+        self._last: dict[int, _Kept] = {}
+        self._next: dict[int, list[_Kept]] = {}
 
-    def of(self, ids: Ids, count: int) -> Floats | None:
-        """The weights (count, B) of global tracks (B,), NaN where there are none; None where there are none at all."""
-        if count not in self._last:
+    def of(self, ids: Ids, sources: Ints) -> Floats | None:
+        """The weights (N, B) of global tracks (B,) that rows of `sources` (N, B) feed, NaN where there are none; None
+        where there are none at all."""
+        if len(sources) < FEWEST or not self._last:
             return None
-        known, weights = self._last[count]
-        at = np.minimum(np.searchsorted(known, ids), len(known) - 1)
-        return np.where(known[at] == ids, weights[:, at], np.nan)
+        out = np.full(sources.shape, np.nan)
+        for count in sorted(self._last, key=lambda count: (count != len(sources), -count)):
+            todo = np.flatnonzero(np.isnan(out[0]))
+            if not len(todo):
+                break
+            kept = self._last[count]
+            at = np.minimum(np.searchsorted(kept.id, ids[todo]), len(kept.id) - 1)
+            there = kept.id[at] == ids[todo]
+            at, todo = at[there], todo[there]
+            if count == len(sources):
+                same = (kept.source[:, at] == sources[:, todo]).all(axis=0)
+                out[:, todo[same]] = kept.weight[:, at[same]]
+                at, todo = at[~same], todo[~same]
+            out[:, todo] = _brought(kept.source[:, at], kept.weight[:, at], sources[:, todo])
+        return out
 
-    def note(self, ids: Ids, weights: Floats) -> None:
+    def note(self, ids: Ids, sources: Ints, weights: Floats) -> None:
         """Weights (N, B) that were used in this step."""
-        if len(weights) >= FEWEST and len(ids):
-            self._next.setdefault(len(weights), []).append((ids, weights))
+        good = np.flatnonzero(~np.isnan(weights[0]))
+        if len(weights) >= FEWEST and len(good):
+            new = _Kept(ids[good], sources[:, good].astype(np.int64), weights[:, good], np.zeros(len(good), np.int64))
+            self._next.setdefault(len(weights), []).append(new)
 
     def turn(self) -> None:
-        """A step is over: what was noted in it is what there is."""
-        self._last = {count: _sorted(parts) for count, parts in self._next.items()}
+        """A step is over: what was noted in it takes the place of what there was."""
+        after = {count: parts[0].join(*parts[1:]) for count, parts in self._next.items()}
+        for count, old in self._last.items():
+            new = after.get(count)
+            stays = old.age < STEPS if new is None else (old.age < STEPS) & ~np.isin(old.id, new.id)
+            if stays.any():
+                kept = old.take(stays)
+                kept = _Kept(kept.id, kept.source, kept.weight, kept.age + 1)
+                after[count] = kept if new is None else new.join(kept)
+        self._last = {count: kept.take(np.argsort(kept.id, kind="stable")) for count, kept in sorted(after.items())}
         self._next = {}
 
     def packed(self) -> list[list[Any]]:
         """As plain values."""
-        return [[count, to_bytes(ids), to_bytes(weights)] for count, (ids, weights) in sorted(self._last.items())]
+        return [
+            [count, *(to_bytes(getattr(kept, one.name)) for one in fields(kept))]
+            for count, kept in sorted(self._last.items())
+        ]
 
     def restore(self, packed: list[list[Any]]) -> None:
         """From what `packed` gave."""
-        for count, ids, weights in packed:
+        whole = np.zeros(0, dtype=np.int64)
+        for count, ids, sources, weights, age in packed:
             names = from_bytes(ids, np.zeros(0, dtype=np.uint64))
-            self._last[count] = names, from_bytes(weights, np.zeros(0)).reshape(count, len(names))
+            shape = count, len(names)
+            self._last[count] = _Kept(
+                names, from_bytes(sources, whole).reshape(shape), from_bytes(weights, np.zeros(0)).reshape(shape),
+                from_bytes(age, whole),
+            )  # fmt: skip
 
 
-def _sorted(parts: list[tuple[Ids, Floats]]) -> tuple[Ids, Floats]:
-    ids = np.concatenate([one for one, _ in parts])
-    order = np.argsort(ids, kind="stable")
-    return ids[order], np.concatenate([weights for _, weights in parts], axis=1)[:, order]
+def _brought(known: Ints, weights: Floats, sources: Ints) -> Floats:
+    """Weights (M, B) of `sources` (M, B) from those (N, B) of the sources `known` (N, B), with sum 1; NaN where the
+    sources now had too little of it."""
+    out = np.zeros(sources.shape)
+    for source, weight in zip(known, weights, strict=True):
+        out += np.where(sources == source, weight, 0.0)
+    total = np.zeros(sources.shape[1])
+    for row in out:
+        total = total + row
+    return np.where(total > ENOUGH, out / np.where(total > ENOUGH, total, 1.0), np.nan)

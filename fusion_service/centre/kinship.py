@@ -66,7 +66,10 @@ def of_rows(intake: Intake, tracks: Tracks, source: Ints) -> Kin:
     """Whose data is in the rows of sources (M,), indices into the sorted names."""
     lineages = intake.lineages
     own = np.array([lineages.of((name,)) for name in intake.names()], dtype=np.int32)
-    codes = np.where(tracks.lineage >= 0, tracks.lineage, own[source] if len(own) else ANYONE).astype(np.int32)
+    told = tracks.lineage >= 0
+    if len(own) and not told.any():
+        return Kin(lineages, own[source], lineages.contain(own, intake.config.name)[source])
+    codes = np.where(told, tracks.lineage, own[source] if len(own) else ANYONE).astype(np.int32)
     return Kin(lineages, codes, lineages.contain(codes, intake.config.name))
 
 

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import find_sorted
 from fusion_service.centre.alarms import Twice
 from fusion_service.centre.compartments import Compartments
 from fusion_service.centre.identity import TRUSTED, Identities
@@ -68,7 +69,7 @@ class Labels:
         nothing. origin: of the message."""
         identity, identity_p = self.identities.named(ids)
         kind, kind_p = self.identities.classed(ids)
-        at = np.searchsorted(self.compartments.track, ids)
+        at = find_sorted(self.compartments.track, ids)
         said, marks = self._intake.said, self._marks(ids, at)
         number, callsign = self._called(ids)
         # an intensity is of all sources, and so are its tracks

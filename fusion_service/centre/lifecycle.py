@@ -12,23 +12,21 @@ tracks otherwise is overdue since the last step that had one. How often the cent
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import picked
+from fusion_service.arrays import find_sorted
 from fusion_service.centre.lineage import NOBODY
-from fusion_service.centre.tracks import as_mixtures, join_tracks, no_parts
+from fusion_service.centre.tracks import as_mixtures, join_tracks, no_parts, taken
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 __all__ = ["WAYS", "Picture", "Support", "advance", "empty_picture", "newborn"]
 
-FEW, WIDEST = 512, 8
-"""Ids that are looked up one by one; and how many times more numbers than ids there may be for a table."""
 WAYS = ("", "tracklet", "bar-shalom-campo derived", "bci derived", "bci declared", "ci", "cu")
 """What a track may be fused by: "" is the rule of the config."""
 
@@ -72,25 +70,15 @@ class Picture:
 
     def take(self, rows: Any) -> Picture:
         """The given rows (indices or a mask)."""
-        return Picture(*(picked(getattr(self, one.name), rows) for one in fields(self)))
+        return cast(Picture, taken(self, rows))
 
     def mixtures(self, rows: Any) -> Mixtures:
         """The densities of the given rows as mixtures."""
         return as_mixtures(self, rows)
 
     def find(self, ids: NDArray[np.uint64]) -> NDArray[np.intp]:
-        """Rows of ids that are in the picture: where each would be inserted. Ids are counted up, so that of many the
-        place is mostly read off a table of how many are below each number there is."""
-        if len(ids) < FEW or len(self.id) < 2:
-            return np.searchsorted(self.id, ids)
-        first, width = self.id[0], int(self.id[-1] - self.id[0]) + 1
-        if width > WIDEST * (len(self.id) + len(ids)):
-            return np.searchsorted(self.id, ids)
-        below = np.zeros(width + 2, dtype=np.intp)
-        below[(self.id - first).astype(np.intp) + 1] = 1
-        np.cumsum(below, out=below)
-        at = np.where(ids > first, np.minimum(ids - first, np.uint64(width)), np.uint64(0))
-        return below[at.astype(np.intp)]
+        """Rows of ids that are in the picture: where each would be inserted."""
+        return find_sorted(self.id, ids)
 
     def join(self, other: Picture) -> Picture:
         """Both, one after the other: sorted where the ids of `other` are above all of these (see `order`)."""

@@ -4,7 +4,8 @@ A global id stays with its target, and is never given to another. Where steps ar
 that begin in them are known already under ids that were given in the first course of these steps, to groups of the same
 local tracks. A group takes the id that one of its local tracks is linked to at the end of the first course; else
 that of a track that one of them founded; else a new one. Only ids of tracks that are not there in the state from which
-the steps are made again may be taken, each once.
+the steps are made again, and that have not ended since, may be taken, each once: an id that has ended never returns. A
+track of that state that has ended in the first course, and is there after the second, goes on under a new id.
 
 The components of an intensity have no ids: their tracks take the id of the nearest birth of the first course within
 the gate.
@@ -12,7 +13,7 @@ the gate.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -61,29 +62,31 @@ class Birth:
 class Book:
     """The births of the steps that may be made again. step: the one that is being made.
 
-    born: those of the present course, in order; spare: of ids that an earlier course has given, and this has not.
+    born: those of the present course, in order; other: the id that a track goes on under that ended, and was there
+    after all, and the step since when.
     """
 
     step: int = 0
     born: list[Birth] = field(default_factory=list)
-    spare: list[Birth] = field(default_factory=list)
+    other: dict[int, tuple[int, int]] = field(default_factory=dict)
     _free: dict[int, Birth] = field(default_factory=dict)
     _links: dict[LocalKey, int] = field(default_factory=dict)
     _founded: dict[LocalKey, list[int]] = field(default_factory=dict)
 
     def clear(self) -> None:
         """Nothing will be made again of what was made so far."""
-        self.born, self.spare = [], []
+        self.born, self.other = [], {}
 
     def forget(self, before: int) -> None:
         """No step before `before` will be made again."""
-        if (self.born and self.born[0].step < before) or self.spare or len(self.born) > MOST_BIRTHS:
+        if (self.born and self.born[0].step < before) or len(self.born) > MOST_BIRTHS:
             self.born = [one for one in self.born if one.step >= before][-MOST_BIRTHS:]
-            self.spare = [one for one in self.spare if one.step >= before][-MOST_BIRTHS:]
+        if self.other and min(step for _, step in self.other.values()) < before:
+            self.other = {one: new for one, new in self.other.items() if new[1] >= before}
 
-    def again(self, step: int, tables: Mapping[str, Table]) -> None:
-        """The steps after `step` are made again. tables: the links until now, by source."""
-        free = [one for one in self.born if one.step > step] + self.spare
+    def again(self, step: int, tables: Mapping[str, Table], ids: Collection[int]) -> None:
+        """The steps after `step` are made again. tables: the links until now, by source; ids: of the picture."""
+        free = [one for one in self.born if one.step > step and one.id in ids]
         self.born = [one for one in self.born if one.step <= step]
         self._free, self._links, self._founded = {one.id: one for one in free}, {}, {}
         ids = np.array(sorted(self._free), dtype=np.uint64)
@@ -95,10 +98,18 @@ class Book:
             if one.founder is not None:
                 self._founded.setdefault(one.founder, []).append(one.id)
 
-    def done(self) -> None:
-        """They are made."""
-        self.spare = list(self._free.values())
+    def done(self, ids: Iterable[int], before: Collection[int], fresh: Callable[[int], list[int]]) -> dict[int, int]:
+        """They are made. ids: of the tracks that there are; before: of those before, and all that are above. The other
+        id {old: new} of each that is there again: the one it has gone on under, if that is there, else a new one."""
         self._free, self._links, self._founded = {}, {}, {}
+        new: dict[int, int] = {}
+        ids = list(ids)
+        for one in ids:
+            if one not in before:
+                known = self.other.get(one, (0, 0))[0]
+                new[one] = known if known in before and known not in ids else fresh(1)[0]
+                self.other[one] = new[one], self.step
+        return new
 
     def allot(self, whom: Sequence[Sequence[LocalKey]] | Places, fresh: Callable[[int], list[int]]) -> list[int]:
         """An id for each group of local tracks that begins a track, or each place; fresh: gives new ones."""

@@ -53,18 +53,7 @@ class Unknown:
     @classmethod
     def of(cls, space: tuple[str, ...], speed: float = 100.0, acceleration: float = 20.0) -> Unknown:
         """speed, acceleration: one sigma of what targets may have, m/s, m/s2."""
-        return _unknown_of(tuple(space), speed, acceleration)
-
-    @classmethod
-    def made(cls, space: tuple[str, ...], speed: float, acceleration: float) -> Unknown:
-        """The same, not kept."""
-        likely = {"x": 1.0, "y": 1.0, "z": PLAUSIBLE_HEIGHT, "turn_rate": PLAUSIBLE_TURN}
-        likely |= dict.fromkeys(("vx", "vy", "vz"), max(speed, 1e-3))
-        likely |= dict.fromkeys(("ax", "ay", "az"), max(acceleration, 1e-3))
-        sigma = np.array([SIGMA[name] for name in space])
-        plausible = np.array([likely[name] for name in space])
-        limit = np.array([UNKNOWN_SIGMA.get(name, np.inf) for name in space])
-        return cls(space, limit**2, sigma**2, plausible**2)
+        return _unknown(tuple(space), speed, acceleration)
 
     def known(self, covariance: Floats) -> NDArray[np.bool_]:
         """Which components (n, ...) of densities with `covariance` (n, n, ...) are known."""
@@ -109,9 +98,15 @@ class Unknown:
         return count, more
 
 
-@lru_cache(maxsize=64)
-def _unknown_of(space: tuple[str, ...], speed: float, acceleration: float) -> Unknown:
-    return Unknown.made(space, speed, acceleration)
+@lru_cache(maxsize=256)
+def _unknown(space: tuple[str, ...], speed: float, acceleration: float) -> Unknown:
+    likely = {"x": 1.0, "y": 1.0, "z": PLAUSIBLE_HEIGHT, "turn_rate": PLAUSIBLE_TURN}
+    likely |= dict.fromkeys(("vx", "vy", "vz"), max(speed, 1e-3))
+    likely |= dict.fromkeys(("ax", "ay", "az"), max(acceleration, 1e-3))
+    sigma = np.array([SIGMA[name] for name in space])
+    plausible = np.array([likely[name] for name in space])
+    limit = np.array([UNKNOWN_SIGMA.get(name, np.inf) for name in space])
+    return Unknown(space, limit**2, sigma**2, plausible**2)
 
 
 def patterns(known: Bools) -> Iterator[tuple[Ints, Any]]:

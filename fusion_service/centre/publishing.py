@@ -106,7 +106,7 @@ def picture_message(
 def _published(picture: Picture, contributions: Contributions, intake: Intake) -> tuple[Picture, Contributions]:
     """What of the picture goes out, by its status and its place."""
     config = intake.config
-    shown = np.isin(picture.status, [STATUSES.index(name) for name in config.publish_status])
+    shown = np.array([name in config.publish_status for name in STATUSES], dtype=np.bool_)[picture.status]
     if config.publish_region is not None and intake.frame is not None:
         places = [config.space.index(axis) for axis in ("x", "y", "z") if axis in config.space]
         shown &= region_holds(config.publish_region, picture.mean[places])

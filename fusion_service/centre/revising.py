@@ -3,7 +3,7 @@ what is told of it.
 
 What was decided in the steps made again is told to nobody, since it was told once already; told is what is otherwise
 now: ids that are no more end as `revised`, replaced by the track that their local tracks are in, where there is one.
-An id that had ended may be back: its target was there after all.
+An id that has ended never returns: if its target was there after all, the track goes on under another.
 """
 
 from __future__ import annotations
@@ -36,13 +36,14 @@ class Revision:
     """Steps of `history` made again, from `start` on in its past, with what came `late`.
 
     intake, ids, following: the intake, the ids of the picture, and the next new id, all before. steps: to be made
-    again; tables: the links of every source before.
+    again; there: the ids; tables: the links of every source before.
     """
 
     def __init__(
         self, history: History, start: int, late: Sequence[Late], intake: Intake, ids: _Ids, following: int
     ) -> None:
-        self._history, self._before, self._ids, self._following = history, intake, ids, following
+        self._history, self._before, self._ids, self.following = history, intake, ids, following
+        self.there = frozenset(ids.tolist())
         late = history.reached(late, start)
         self._late = {one.key for one in late}
         self._queued = {id(one.event) for one in late}
@@ -102,11 +103,12 @@ class Revision:
             if name in self._before.sources:
                 source.repeats = max(source.repeats, self._before.sources[name].repeats)
 
-    def tell(self, journal: Journal, intake: Intake, ids: _Ids) -> int | None:
-        """Tell the journal of the step what has been revised; ids: of the picture now. The time of the first step that
-        is otherwise, ns; None where nothing has come of it."""
+    def tell(self, journal: Journal, intake: Intake, ids: _Ids, other: Mapping[int, int]) -> int | None:
+        """Tell the journal of the step what has been revised; ids: of the picture now; other: {id that had ended: the
+        one it goes on under}. The time of the first step that is otherwise, ns; None where nothing has come of it."""
         for entry in self._taken:
             journal.accept(entry)
+            self._history.reordered[entry.source] += self._overtaken(entry)
         for entry in self._refused:
             journal.refuse(entry)
         if not self._moved:
@@ -119,18 +121,26 @@ class Revision:
         new = ids[~np.isin(ids, self._ids)]
         names = sorted({name for name, *_ in self._moved})[:MOST_TOLD]
         event = {"kind": "revised", "since": since, "steps": steps, "messages": len(self._moved), "sources": names}
-        back = new[new < self._following].tolist()[:MOST_TOLD]
+        back = [list(pair) for pair in sorted(other.items())][:MOST_TOLD]
         journal.event(event | ({"back": back} if back else {}))
-        journal.birth(new[new >= self._following])
+        journal.birth(new)
         for track in gone.tolist():
-            journal.end(track, "revised", self._heir(track, intake, ids))
+            journal.end(track, "revised", self._heir(track, intake, ids, other))
         return since
 
-    def _heir(self, track: int, intake: Intake, ids: _Ids) -> int | None:
+    def _overtaken(self, entry: Entry) -> bool:
+        """Whether a late message came after one of its source with a higher number."""
+        source = self._before.sources.get(entry.source)
+        return (
+            source is not None and source.epoch == entry.epoch and entry.seq < max(source.highest.values(), default=0)
+        )
+
+    def _heir(self, track: int, intake: Intake, ids: _Ids, other: Mapping[int, int]) -> int | None:
         """The track of `ids` that goes on for one that is no more."""
         heir, steps = track, 0
         while heir in self._heirs and steps < MOST_TOLD:
             heir, steps = self._heirs[heir], steps + 1
+        heir = other.get(heir, heir)
         if heir == track or not _has(ids, heir):
             heir = self._now(track, intake, ids) or track
         return heir if heir != track and _has(ids, heir) else None

@@ -118,11 +118,11 @@ def message_tracks(
     """
     first = messages[0]
     means, covariances, weights, sizes = (
-        np.concatenate(column) for column in zip(*map(_components, messages, sound), strict=True)
+        _joined(column) for column in zip(*map(_components, messages, sound), strict=True)
     )
     means, covariances = transformed(means, covariances, first.space, first.frame, frame, first.height or height)
     if sizes.max(initial=1) == 1:
-        mean, covariance = linalg.to_last(means, 1), linalg.symmetrise(linalg.to_last(covariances, 2))
+        mean, covariance = linalg.to_last(means, 1), linalg.to_last(covariances, 2)
         parts = no_parts(len(mean), len(sizes))
     else:
         mixtures = Mixtures.from_rows(weights, means, covariances, sizes).normalised()
@@ -179,12 +179,22 @@ def _told(
 def _components(message: LocalTracks, sound: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, NDArray[np.intp]]:
     """Means, covariances and weights of the components of the sound tracks, and how many each of these has."""
     if message.counts is None or message.weights is None:
-        count = int(sound.sum())
-        return message.means[sound], message.covariances[sound], np.ones(count), np.ones(count, dtype=np.intp)
+        means, covariances = _some(message.means, sound), _some(message.covariances, sound)
+        return means, covariances, np.ones(len(means)), np.ones(len(means), dtype=np.intp)
     counts = message.counts.astype(np.intp)
     rows = np.repeat(sound, counts)
     return message.means[rows], message.covariances[rows], message.weights[rows], counts[sound]
 
 
 def _gather(columns: Sequence[NDArray[Any]], rows: Sequence[NDArray[np.bool_]]) -> NDArray[Any]:
-    return np.concatenate([column[mask] for column, mask in zip(columns, rows, strict=True)])
+    """Always arrays of their own: those of a message may not be written."""
+    return np.concatenate([_some(column, mask) for column, mask in zip(columns, rows, strict=True)])
+
+
+def _some(column: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
+    """The rows of the mask; the column itself where that is all of them."""
+    return column if mask.all() else column[mask]
+
+
+def _joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    return columns[0] if len(columns) == 1 else np.concatenate(columns)

@@ -9,9 +9,10 @@ from typing import Any, ParamSpec, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["FAST", "Floats", "either"]
+__all__ = ["FAST", "Floats", "Places", "either"]
 
 Floats = NDArray[np.float64]
+Places = NDArray[np.int64]
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")

@@ -4,9 +4,9 @@ Each is the same additions, multiplications and divisions in the same order as i
 same bits; nothing may be contracted or put in another order. Written for numba, and plain Python: called as they stand
 they compute the same, slowly, which is how they are tested where there is no numba.
 
-The batch is cut into `LANES` elements, so that what is worked on stays in the nearest cache and every innermost loop
-runs over neighbours. A batch of matrices is (n, n, B), of which the lower triangle is read; results are written into
-what is given, contiguous.
+The batch is cut into `LANES` elements, so that what is worked on stays in the nearest cache, and every innermost loop
+runs over neighbours of rows that are named before it (an index like `s + b` would keep it from being vectorised). A
+batch of matrices is (n, n, B), of which the lower triangle is read; results are written into what is given, contiguous.
 """
 
 from __future__ import annotations
@@ -28,47 +28,52 @@ def invert(P: Floats, out: Floats, det: Floats, margin: Floats, least: Floats) -
         w = min(LANES, size - s)
         for i in range(n):
             for j in range(i + 1):
-                for b in range(w):
-                    W[i, j, b] = P[i, j, s + b]
-        for b in range(w):
-            det[s + b] = 1.0
+                W[i, j, :w] = P[i, j, s : s + w]
+        all_of, low, flat = det[s : s + w], least[s : s + w], margin[s : s + w]
         for k in range(n):
+            pivot, row = W[k, k], P[k, k, s : s + w]
             for b in range(w):
-                det[s + b] *= W[k, k, b]
+                all_of[b] = pivot[b] if k == 0 else all_of[b] * pivot[b]
             for b in range(w):
-                W[k, k, b] = 1.0 / W[k, k, b]
+                pivot[b] = 1.0 / pivot[b]
+            for b in range(w):
+                relative = 1.0 / (pivot[b] * abs(row[b]))
+                flat[b] = relative if k == 0 or relative < flat[b] or relative != relative else flat[b]
+            for b in range(w):
+                low[b] = pivot[b] if k == 0 or pivot[b] < low[b] or pivot[b] != pivot[b] else low[b]
             for i in range(k + 1, n):
+                to, row = W[k, i], W[i, k]
                 for b in range(w):
-                    W[k, i, b] = W[i, k, b] * -W[k, k, b]
+                    to[b] = row[b] * -pivot[b]
             for i in range(k + 1, n):
+                minus = W[k, i]
                 for j in range(k + 1, i + 1):
+                    to, row = W[i, j], W[j, k]
                     for b in range(w):
-                        W[i, j, b] += W[j, k, b] * W[k, i, b]
-        for k in range(n):
-            for b in range(w):
-                pivot, relative = W[k, k, b], 1.0 / (W[k, k, b] * abs(P[k, k, s + b]))
-                if k == 0 or relative < margin[s + b] or relative != relative:
-                    margin[s + b] = relative
-                if k == 0 or pivot < least[s + b] or pivot != pivot:
-                    least[s + b] = pivot
+                        to[b] += row[b] * minus[b]
         for i in range(2, n):
             for k in range(1, i):
+                factor = W[k, i]
                 for a in range(k):
+                    to, row = W[a, i], W[a, k]
                     for b in range(w):
-                        W[a, i, b] += W[a, k, b] * W[k, i, b]
+                        to[b] += row[b] * factor[b]
         for k in range(1, n):
+            pivot = W[k, k]
             for a in range(k):
+                to, row = W[k, a], W[a, k]
                 for b in range(w):
-                    W[k, a, b] = W[a, k, b] * W[k, k, b]
+                    to[b] = row[b] * pivot[b]
             for i in range(k):
+                factor = W[k, i]
                 for j in range(i + 1):
+                    to, row = W[i, j], W[j, k]
                     for b in range(w):
-                        W[i, j, b] += W[k, i, b] * W[j, k, b]
+                        to[b] += factor[b] * row[b]
         for i in range(n):
             for j in range(i + 1):
-                for b in range(w):
-                    out[i, j, s + b] = W[i, j, b]
-                    out[j, i, s + b] = W[i, j, b]
+                out[i, j, s : s + w] = W[i, j, :w]
+                out[j, i, s : s + w] = W[i, j, :w]
 
 
 def pivots(P: Floats, d: Floats) -> None:
@@ -79,17 +84,18 @@ def pivots(P: Floats, d: Floats) -> None:
         w = min(LANES, size - s)
         for i in range(n):
             for j in range(i + 1):
-                for b in range(w):
-                    W[i, j, b] = P[i, j, s + b]
+                W[i, j, :w] = P[i, j, s : s + w]
         for k in range(n):
-            for b in range(w):
-                d[k, s + b] = W[k, k, b]
+            pivot = W[k, k]
+            d[k, s : s + w] = pivot[:w]
             for i in range(k + 1, n):
+                row = W[i, k]
                 for b in range(w):
-                    m[b] = W[i, k, b] * (-1.0 / W[k, k, b])
+                    m[b] = row[b] * (-1.0 / pivot[b])
                 for j in range(k + 1, i + 1):
+                    to, row = W[i, j], W[j, k]
                     for b in range(w):
-                        W[i, j, b] += W[j, k, b] * m[b]
+                        to[b] += row[b] * m[b]
 
 
 def ldl(P: Floats, L: Floats, d: Floats) -> None:
@@ -99,22 +105,22 @@ def ldl(P: Floats, L: Floats, d: Floats) -> None:
     for s in range(0, size, LANES):
         w = min(LANES, size - s)
         for i in range(n):
-            for j in range(i + 1):
-                for b in range(w):
-                    W[i, j, b] = P[i, j, s + b]
+            for j in range(n):
+                W[i, j, :w] = P[i, j, s : s + w]
+                L[i, j, s : s + w] = 1.0 if i == j else 0.0
         for k in range(n):
-            for b in range(w):
-                d[k, s + b] = W[k, k, b]
-            for i in range(n):
-                for b in range(w):
-                    L[i, k, s + b] = 1.0 if i == k else 0.0
+            pivot = W[k, k]
+            d[k, s : s + w] = pivot[:w]
             for i in range(k + 1, n):
+                to, row = L[i, k, s : s + w], W[i, k]
                 for b in range(w):
-                    L[i, k, s + b] = W[i, k, b] / W[k, k, b]
+                    to[b] = row[b] / pivot[b]
             for i in range(k + 1, n):
+                factor = L[i, k, s : s + w]
                 for j in range(k + 1, i + 1):
+                    to, row = W[i, j], W[j, k]
                     for b in range(w):
-                        W[i, j, b] -= L[i, k, s + b] * W[j, k, b]
+                        to[b] -= factor[b] * row[b]
 
 
 def solve(P: Floats, x: Floats, y: Floats, square: Floats, back: bool) -> None:
@@ -125,37 +131,46 @@ def solve(P: Floats, x: Floats, y: Floats, square: Floats, back: bool) -> None:
         w = min(LANES, size - s)
         for i in range(n):
             for j in range(i + 1):
-                for b in range(w):
-                    W[i, j, b] = P[i, j, s + b]
-            for b in range(w):
-                Y[i, b] = x[i, s + b]
+                W[i, j, :w] = P[i, j, s : s + w]
+            Y[i, :w] = x[i, s : s + w]
         for k in range(n):
+            pivot, known = W[k, k], Y[k]
             for i in range(k + 1, n):
+                to, row = L[i, k], W[i, k]
                 for b in range(w):
-                    L[i, k, b] = W[i, k, b] / W[k, k, b]
+                    to[b] = row[b] / pivot[b]
             for i in range(k + 1, n):
+                factor = L[i, k]
                 for j in range(k + 1, i + 1):
+                    to, row = W[i, j], W[j, k]
                     for b in range(w):
-                        W[i, j, b] -= L[i, k, b] * W[j, k, b]
+                        to[b] -= factor[b] * row[b]
+                to = Y[i]
                 for b in range(w):
-                    Y[i, b] -= L[i, k, b] * Y[k, b]
+                    to[b] -= factor[b] * known[b]
         if back:
             for i in range(n):
+                to, pivot = Y[i], W[i, i]
                 for b in range(w):
-                    Y[i, b] /= W[i, i, b]
+                    to[b] /= pivot[b]
             for k in range(n - 1, 0, -1):
+                known = Y[k]
                 for i in range(k):
+                    to, factor = Y[i], L[k, i]
                     for b in range(w):
-                        Y[i, b] -= L[k, i, b] * Y[k, b]
+                        to[b] -= factor[b] * known[b]
             for i in range(n):
-                for b in range(w):
-                    y[i, s + b] = Y[i, b]
+                y[i, s : s + w] = Y[i, :w]
         else:
-            for b in range(w):
-                square[s + b] = Y[0, b] * Y[0, b] / W[0, 0, b]
-            for i in range(1, n):
-                for b in range(w):
-                    square[s + b] += Y[i, b] * Y[i, b] / W[i, i, b]
+            one = square[s : s + w]
+            for i in range(n):
+                row, pivot = Y[i], W[i, i]
+                if i == 0:
+                    for b in range(w):
+                        one[b] = row[b] * row[b] / pivot[b]
+                else:
+                    for b in range(w):
+                        one[b] += row[b] * row[b] / pivot[b]
 
 
 def matvec(A: Floats, x: Floats, out: Floats) -> None:
@@ -164,26 +179,33 @@ def matvec(A: Floats, x: Floats, out: Floats) -> None:
     for s in range(0, size, LANES):
         w = min(LANES, size - s)
         for i in range(m):
-            for b in range(w):
-                out[i, s + b] = A[i, 0, s + b] * x[0, s + b]
-            for k in range(1, n):
-                for b in range(w):
-                    out[i, s + b] += A[i, k, s + b] * x[k, s + b]
+            to = out[i, s : s + w]
+            for k in range(n):
+                row, factor = A[i, k, s : s + w], x[k, s : s + w]
+                if k == 0:
+                    for b in range(w):
+                        to[b] = row[b] * factor[b]
+                else:
+                    for b in range(w):
+                        to[b] += row[b] * factor[b]
 
 
 def product(A: Floats, B: Floats, out: Floats) -> None:
     """A B (m, n, B) of A (m, k, B) and B (k, n, B)."""
     m, inside, size = A.shape
-    n = B.shape[1]
     for s in range(0, size, LANES):
         w = min(LANES, size - s)
         for i in range(m):
-            for j in range(n):
-                for b in range(w):
-                    out[i, j, s + b] = A[i, 0, s + b] * B[0, j, s + b]
-                for k in range(1, inside):
-                    for b in range(w):
-                        out[i, j, s + b] += A[i, k, s + b] * B[k, j, s + b]
+            for j in range(B.shape[1]):
+                to = out[i, j, s : s + w]
+                for k in range(inside):
+                    row, factor = A[i, k, s : s + w], B[k, j, s : s + w]
+                    if k == 0:
+                        for b in range(w):
+                            to[b] = row[b] * factor[b]
+                    else:
+                        for b in range(w):
+                            to[b] += row[b] * factor[b]
 
 
 def inner(A: Floats, B: Floats, out: Floats) -> None:
@@ -192,18 +214,25 @@ def inner(A: Floats, B: Floats, out: Floats) -> None:
     twice = np.empty(LANES)
     for s in range(0, size, LANES):
         w = min(LANES, size - s)
-        for b in range(w):
-            out[s + b] = A[0, 0, s + b] * B[0, 0, s + b]
-        for i in range(1, n):
-            for b in range(w):
-                twice[b] = A[i, 0, s + b] * B[i, 0, s + b]
-            for j in range(1, i):
+        to = out[s : s + w]
+        for i in range(n):
+            for j in range(i):
+                row, other = A[i, j, s : s + w], B[i, j, s : s + w]
+                if j == 0:
+                    for b in range(w):
+                        twice[b] = row[b] * other[b]
+                else:
+                    for b in range(w):
+                        twice[b] += row[b] * other[b]
+            row, other = A[i, i, s : s + w], B[i, i, s : s + w]
+            if i == 0:
                 for b in range(w):
-                    twice[b] += A[i, j, s + b] * B[i, j, s + b]
-            for b in range(w):
-                out[s + b] += twice[b] + twice[b]
-            for b in range(w):
-                out[s + b] += A[i, i, s + b] * B[i, i, s + b]
+                    to[b] = row[b] * other[b]
+            else:
+                for b in range(w):
+                    to[b] += twice[b] + twice[b]
+                for b in range(w):
+                    to[b] += row[b] * other[b]
 
 
 def congruence(F: Floats, P: Floats, out: Floats) -> None:
@@ -216,20 +245,23 @@ def congruence(F: Floats, P: Floats, out: Floats) -> None:
         half[:] = 0.0
         for i in range(m):
             for k in range(n):
-                if F[i, k] != 0.0:
+                factor = F[i, k]
+                if factor != 0.0:
                     for j in range(n):
+                        to, row = half[i, j], P[k, j, s : s + w]
                         for b in range(w):
-                            half[i, j, b] += F[i, k] * P[k, j, s + b]
+                            to[b] += factor * row[b]
         for i in range(m):
             for j in range(i + 1):
-                for b in range(w):
-                    out[i, j, s + b] = 0.0
+                one, other = out[i, j, s : s + w], out[j, i, s : s + w]
+                one[:] = 0.0
                 for k in range(n):
-                    if F[j, k] != 0.0:
+                    factor = F[j, k]
+                    if factor != 0.0:
+                        row = half[i, k]
                         for b in range(w):
-                            out[i, j, s + b] += F[j, k] * half[i, k, b]
-                for b in range(w):
-                    out[j, i, s + b] = out[i, j, s + b]
+                            one[b] += factor * row[b]
+                other[:] = one
 
 
 def congruence_each(F: Floats, P: Floats, out: Floats) -> None:
@@ -241,15 +273,17 @@ def congruence_each(F: Floats, P: Floats, out: Floats) -> None:
         half[:] = 0.0
         for i in range(m):
             for k in range(n):
+                each = F[i, k, s : s + w]
                 for j in range(n):
+                    to, row = half[i, j], P[k, j, s : s + w]
                     for b in range(w):
-                        half[i, j, b] += F[i, k, s + b] * P[k, j, s + b]
+                        to[b] += each[b] * row[b]
         for i in range(m):
             for j in range(i + 1):
-                for b in range(w):
-                    out[i, j, s + b] = 0.0
+                one, other = out[i, j, s : s + w], out[j, i, s : s + w]
+                one[:] = 0.0
                 for k in range(n):
+                    each, row = F[j, k, s : s + w], half[i, k]
                     for b in range(w):
-                        out[i, j, s + b] += F[j, k, s + b] * half[i, k, b]
-                for b in range(w):
-                    out[j, i, s + b] = out[i, j, s + b]
+                        one[b] += each[b] * row[b]
+                other[:] = one

@@ -6,16 +6,15 @@ Compiled code is kept beside the kernels, or, where that place cannot be written
 
 from __future__ import annotations
 
-import inspect
 import os
 import threading
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from types import SimpleNamespace
+from types import FunctionType, SimpleNamespace
 from typing import Any
 
-from fusion_service.compiled import kernels
+from fusion_service.compiled import groups, kernels
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
 
@@ -94,45 +93,48 @@ def _compiled(wanted: bool, stop: threading.Event | None) -> tuple[str, SimpleNa
         if wanted:
             raise ValueError(f"numba cannot be used ({error}): pip install 'track-fusion-centre[fast]'") from None
         return PLAIN, None
-    for name in RESULTS:
+    for name in SHAPES:
         if stop is not None and stop.is_set():
             return PLAIN, None
+        if name == "intersect":
+            _MADE.update({helper: _kernel(numba, getattr(groups, helper), ()) for helper in HELPERS})
         if name not in _MADE:
-            _MADE[name] = _kernel(numba, getattr(kernels, name))
+            function = getattr(kernels if hasattr(kernels, name) else groups, name)
+            _MADE[name] = _kernel(numba, function, (_signature(numba, name),))
     return f"numba {numba.__version__}", SimpleNamespace(**_MADE)
 
 
-def _kernel(numba: Any, function: Callable[..., None]) -> Any:
-    """The function, compiled for views of any strides as arguments and contiguous arrays as results."""
-    names = inspect.signature(function).parameters
-    signature = numba.types.void(*(_type(numba, name, function.__name__) for name in names))
+def _kernel(numba: Any, function: Any, signature: tuple[Any, ...]) -> Any:
+    """The function, compiled; what it calls are the kernels that are compiled already."""
+    known = {**function.__globals__, **{name: made for name, made in _MADE.items() if name in function.__globals__}}
+    again = FunctionType(function.__code__, known, function.__name__)
+    again.__module__, again.__qualname__ = function.__module__, function.__qualname__
     options = {"error_model": "numpy", "nogil": True}
     try:
-        return numba.njit(signature, cache=True, **options)(function)
+        return numba.njit(*signature, cache=True, **options)(again)
     except (RuntimeError, OSError):  # no place to keep it
-        return numba.njit(signature, **options)(function)
+        return numba.njit(*signature, **options)(again)
 
 
-MATRICES, VECTORS = ("P", "A", "B", "F"), ("x",)
-RESULTS = {
-    "invert": {"out": 3, "det": 1, "margin": 1, "least": 1},
-    "pivots": {"d": 2},
-    "ldl": {"L": 3, "d": 2},
-    "solve": {"y": 2, "square": 1},
-    "matvec": {"out": 2},
-    "product": {"out": 3},
-    "inner": {"out": 1},
-    "congruence": {"out": 3},
-    "congruence_each": {"out": 3},
+SHAPES = {
+    "invert": ((3,), (3, 1, 1, 1)),
+    "pivots": ((3,), (2,)),
+    "ldl": ((3,), (3, 2)),
+    "solve": ((3, 2), (2, 1)),
+    "matvec": ((3, 2), (2,)),
+    "product": ((3, 3), (3,)),
+    "inner": ((3, 3), (1,)),
+    "congruence": ((2, 3), (3,)),
+    "congruence_each": ((3, 3), (3,)),
+    "intersect": ((2, 3, 0), (2, 3, 1, 2, 3, 1)),
 }
-"""Number of axes of what each kernel writes."""
+"""Numbers of axes of what each kernel reads, and then writes; 0: places (G, k). `solve` takes a flag at the end."""
+HELPERS = ("_turned", "_lowered", "_sum", "_copied", "_solved")
 
 
-def _type(numba: Any, argument: str, kernel: str) -> Any:
+def _signature(numba: Any, name: str) -> Any:
     types = numba.types
-    if argument in RESULTS[kernel]:
-        return types.Array(types.float64, RESULTS[kernel][argument], "C")
-    if argument in MATRICES:
-        axes = 2 if (kernel, argument) == ("congruence", "F") else 3
-        return types.Array(types.float64, axes, "A", readonly=True)
-    return types.Array(types.float64, 2, "A", readonly=True) if argument in VECTORS else types.boolean
+    kinds = [(types.float64, axes) if axes else (types.int64, 2) for axes in SHAPES[name][0]]
+    read = [types.Array(kind, axes, "C", readonly=True) for kind, axes in kinds]
+    written = [types.Array(types.float64, axes, "C") for axes in SHAPES[name][1]]
+    return types.void(*read, *written, *([types.boolean] if name == "solve" else []))

@@ -11,18 +11,16 @@ from typing import Any
 
 import numpy as np
 
-from fusion_service.compiled.either import Floats
+from fusion_service.compiled.either import Floats, Places
 
 __all__ = ["functions"]
 
 F8 = np.dtype(np.float64)
-MANY = 2048
-"""Elements from which on NumPy is as fast at what is a few passes over the data."""
 
 
 def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     """By name, over these `kernels` (those of the module, compiled or as they are)."""
-    return {**_inverses(kernels), **_factors(kernels), **_products(kernels)}
+    return {**_inverses(kernels), **_factors(kernels), **_products(kernels), "intersect": _groups(kernels)}
 
 
 def _fits(a: Floats, *others: Floats) -> bool:
@@ -30,7 +28,8 @@ def _fits(a: Floats, *others: Floats) -> bool:
 
 
 def _flat(a: Floats, core: int) -> Floats:
-    return a if a.ndim == core + 1 else a.reshape(*a.shape[:core], -1)
+    """Contiguous, with one batch axis."""
+    return np.ascontiguousarray(a if a.ndim == core + 1 else a.reshape(*a.shape[:core], -1))
 
 
 def _inverses(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
@@ -67,7 +66,7 @@ def _factors(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
         return d.reshape(P.shape[1:])
 
     def ldl(P: Floats) -> tuple[Floats, Floats] | None:
-        if not _fits(P) or P[0, 0].size > MANY:
+        if not _fits(P):
             return None
         p = _flat(P, 2)
         L, d = np.empty(p.shape), np.empty(p.shape[1:])
@@ -92,7 +91,7 @@ def _factors(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
 
 def _products(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     def matvec(A: Floats, x: Floats) -> Floats | None:
-        if not _fits(A, x) or A.shape[1:] != x.shape or x[0].size > MANY:
+        if not _fits(A, x) or A.shape[1:] != x.shape:
             return None
         out = np.empty((len(A), x[0].size))
         kernels.matvec(_flat(A, 2), _flat(x, 1), out)
@@ -107,7 +106,7 @@ def _products(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
         return out.reshape(shape)
 
     def inner(A: Floats, B: Floats) -> Floats | None:
-        if not _fits(A, B) or A.shape != B.shape or A.ndim < 3 or A[0, 0].size > MANY:
+        if not _fits(A, B) or A.shape != B.shape or A.ndim < 3:
             return None
         out = np.empty(A[0, 0].size)
         kernels.inner(_flat(A, 2), _flat(B, 2), out)
@@ -115,16 +114,32 @@ def _products(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
 
     def congruence(F: Floats, P: Floats) -> Floats | None:
         shared = F.ndim == 2
-        if not _fits(P, F) or F.shape[1] != len(P) or P.ndim < 3 or P[0, 0].size > MANY:
+        if not _fits(P, F) or F.shape[1] != len(P) or P.ndim < 3:
             return None
         if not (shared or F.shape[2:] == P.shape[2:]):
             return None
         m, p = len(F), _flat(P, 2)
         out = np.empty((m, m, p.shape[2]))
         if shared:
-            kernels.congruence(F, p, out)
+            kernels.congruence(np.ascontiguousarray(F), p, out)
         else:
             kernels.congruence_each(_flat(F, 2), p, out)
         return out.reshape(m, m, *P.shape[2:])
 
     return {"matvec": matvec, "product": product, "inner": inner, "congruence": congruence}
+
+
+def _groups(kernels: SimpleNamespace) -> Callable[..., Any]:
+    def intersect(x: Floats, P: Floats, rows: Places, others: tuple[Floats, Floats]) -> tuple[Floats, ...] | None:
+        """Of rows (n, M), (n, n, M) in groups (G, k), see `groups.intersect`: mean, covariance and margin of each
+        group, and the margins (M,) of the others of each row, which are written into `others`."""
+        if x.dtype != F8 or P.dtype != F8 or rows.shape[1] < 2:
+            return None
+        n, size = len(x), len(rows)
+        mean, covariance, margin = np.empty((n, size)), np.empty((n, n, size)), np.empty(size)
+        beside = np.empty(x.shape[1])
+        at = np.ascontiguousarray(rows, dtype=np.int64)
+        kernels.intersect(_flat(x, 1), _flat(P, 2), at, mean, covariance, margin, *others, beside)
+        return mean, covariance, margin, beside
+
+    return intersect

@@ -2,7 +2,8 @@
 
 A global id is (generation, counter), 32 bits each. Every start takes a new generation and writes it to disk
 before any id of it is used: that reserves the block of 2^32 counters under it, and no id is ever given
-twice, whatever is killed when. A generation is also never below the seconds since 2020, so that a lost folder
+twice, whatever is killed when. Ids that end between two checkpoints are noted in a file beside it, so that none comes
+back with an older checkpoint. A generation is also never below the seconds since 2020, so that a lost folder
 does no harm while the clock is right.
 """
 
@@ -14,6 +15,9 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from fusion_service.errors import FusionError
 
@@ -75,6 +79,21 @@ class State:
             sync = now - self._synced > SYNC_PERIOD
             self._synced = now if sync else self._synced
             self._write("checkpoint", blob, sync=sync)
+            with contextlib.suppress(FileNotFoundError):
+                os.truncate(self._folder / "ended", 0)
+
+    def ended(self) -> NDArray[np.uint64]:
+        """The ids that have ended since the last checkpoint was made."""
+        if self._folder is None or not (self._folder / "ended").exists():
+            return np.zeros(0, dtype=np.uint64)
+        data = (self._folder / "ended").read_bytes()
+        return np.frombuffer(data[: len(data) // 8 * 8], dtype="<u8").astype(np.uint64)
+
+    def note_ended(self, ids: NDArray[np.uint64]) -> None:
+        """These have ended, which will be published: after kill -9 they are among `ended`."""
+        if self._folder is not None and len(ids):
+            with open(self._folder / "ended", "ab") as file:
+                file.write(ids.astype("<u8").tobytes())
 
     def _write(self, name: str, data: bytes, *, sync: bool) -> None:
         assert self._folder is not None

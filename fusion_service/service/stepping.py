@@ -1,9 +1,10 @@
 """A centre that goes on whatever happens: it is made from its checkpoint, and made again from it should a step fail.
 
-What a step publishes waits for the disk only where a lost checkpoint would take back what was said of ids: a track was
-born, ended, merged or split, or something other than data came in (a source, an order, an era). Else the checkpoint is
-saved after publishing, `SAVED_EVERY` at most. So a service that is killed goes on with the same ids, from data that are
-a second old at most; new ids are of a generation of their own in any case (`state`).
+What a step publishes waits for the disk only where a lost checkpoint would take back what was said: a track is
+confirmed, merged or split, or something other than data came in (a source, an order, an era). Ids that end are noted in
+a few bytes (`State.note_ended`), since an id that has ended never returns. Else the checkpoint is saved after
+publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the same ids, from data that are a
+second old at most; only tracks that were tentative and younger than that get new ones, of a generation of their own.
 """
 
 from __future__ import annotations
@@ -15,6 +16,9 @@ from collections import Counter
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fusion_service.centre import Centre, ClockSet, Event, Order, StepResult, make_centre
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
@@ -24,6 +28,7 @@ from schemas import encode, messages
 
 __all__ = ["SAVED_EVERY", "LastingCentre", "Made"]
 
+NONE: NDArray[np.uint64] = np.zeros(0, dtype=np.uint64)
 SAVED_EVERY = 1.0
 """Seconds between checkpoints of steps that change no id."""
 
@@ -64,12 +69,15 @@ class LastingCentre:
         self._changed = False
         self._saved_at = float("-inf")
         self._checkpoint = state.load()
+        self._ended = [state.ended()]
         self._generation = state.new_generation()
         self.centre = self._make_centre()
         desk.follow(self.centre)
 
     def _make_centre(self) -> Centre:
         epoch = time.time_ns()
+        if self._checkpoint is not None:
+            self._checkpoint, self._ended = without(self._config, self._checkpoint, np.concatenate(self._ended)), [NONE]
         centre, fault = make_centre(self._config, self._checkpoint, generation=self._generation, epoch=epoch)
         if fault:
             log.warning("starting without the checkpoint: %s", fault)
@@ -103,6 +111,7 @@ class LastingCentre:
 
     def _keep(self, checkpoint: bytes) -> None:
         self._checkpoint, self._changed, self._saved_at = checkpoint, False, time.monotonic()
+        self._ended = [NONE]
         try:
             self._state.save(checkpoint)
         except OSError as error:
@@ -119,7 +128,17 @@ class LastingCentre:
         self._changed = True
         if checkpoint is not None:
             self._keep(checkpoint)
+        else:
+            self._note_ended(np.array([track for track, _, _ in result.tracks.ended], dtype=np.uint64))
         return Made(result, payloads)
+
+    def _note_ended(self, ids: NDArray[np.uint64]) -> None:
+        self._ended.append(ids)
+        try:
+            self._state.note_ended(ids)
+        except OSError as error:
+            self._counts["unsaved"] += 1
+            self._told.error("cannot note what has ended: %s", error)
 
     def _recover(self, at: int) -> Made | None:
         """A step failed, by a fault of ours: drop what came in since the last one, and make it from the last
@@ -149,6 +168,17 @@ class LastingCentre:
 
 
 def _settles(result: StepResult) -> bool:
-    """Whether a step says something of ids, or obeys something, that a centre made anew must know."""
+    """Whether a step says something, or obeys something, that a centre made anew must know."""
     picture, log = result.tracks, result.log
-    return bool(picture.ended or picture.split_from or log.events or (log.decisions.kind == messages.BORN).any())
+    merged = any(heir is not None for _, _, heir in picture.ended)
+    return bool(merged or picture.split_from or log.events or (log.decisions.kind == messages.CONFIRMED_NOW).any())
+
+
+def without(config: CentreConfig, checkpoint: bytes, ended: NDArray[np.uint64]) -> bytes:
+    """A checkpoint without the global tracks `ended`; as it is where it holds none of them, or cannot be read."""
+    if not len(ended):
+        return checkpoint
+    centre, fault = make_centre(config, checkpoint)
+    if fault:
+        return checkpoint
+    return centre.checkpoint() if centre.let_go(ended) else checkpoint

@@ -10,6 +10,7 @@ import pytest
 
 import schemas
 from fusion_service.centre import ArrivalClock, FusionCentre, Order, Refused
+from fusion_service.centre.arrival import TICK
 from fusion_service.config import CentreConfig, centre_config
 from fusion_service.review.replay import run_replay
 from fusion_service.review.snapshots import ShownTracks
@@ -193,6 +194,22 @@ def test_full_pictures_and_deltas_tell_of_all_that_has_changed(seed: int) -> Non
     assert full == 6
     assert 0 < listed < sum(len(one.picture.ids) for one in flight.steps if one.tracks.delta)
     assert sum(bool(one.tracks.delta) for one in flight.steps) > 20
+
+
+def test_scans_of_one_time_make_no_step_again_however_they_come() -> None:
+    centre = FusionCentre({**CONFIG, "frame": {"kind": "enu", "lat": 59.0, "lon": -55.0}})
+    now, kinds = START + 9 * SECOND, []
+    for name in ("r1", "r2", "r3"):
+        centre.handle(info(name, period=0.1), now)
+    for k in range(1, 10):
+        for name in ("r1", "r2", "r3"):
+            centre.handle(tracks(name, 0.1 * k, [[50.0 * k, 0, 500.0, 0]], seq=k), now)
+            shown = centre.step(max(START + k * SECOND // 10, centre.time + TICK)).tracks
+            assert shown.revised is None
+            kinds.append(bool(shown.delta))
+    assert kinds == [False] + [True] * 26
+    centre.handle(tracks("r1", 0.85, [[425.0, 0, 500.0, 0]], seq=100), now)
+    assert centre.step(centre.time + TICK).tracks.revised is not None
 
 
 def test_a_track_that_leaves_what_is_published_makes_the_picture_full() -> None:

@@ -226,7 +226,7 @@ def test_a_table_full_of_tracks_takes_its_own_updates_and_refuses_more() -> None
 
 
 def test_a_filler_of_before_the_first_message_mends_no_gap() -> None:
-    made = centre(("r1",))
+    made = centre(("r1",), revise=0.0)
     give(made, *(tracks("r1", 1 + k / 100, truth(1), seq=seq) for k, seq in enumerate((10, 13))))
     step(made, 2)
     give(made, tracks("r1", 1.5, truth(1), seq=5), tracks("r1", 1.6, truth(1), seq=11))

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 import schemas
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Floats, Ints
 from fusion_service.centre import FusionCentre
-from fusion_service.centre.kept_weights import KeptWeights
+from fusion_service.centre.kept_weights import STEPS, Ids, KeptWeights
 from fusion_service.rules import fuse_last
 from fusion_service.rules.ci import KEPT
 
@@ -47,8 +47,8 @@ def test_what_is_kept_is_within_its_certificate(N: int, criterion: str) -> None:
 
 
 VALUES: dict[str, Callable[[Floats], Floats]] = {
-    "det": lambda P: np.linalg.det(np.moveaxis(P, -1, 0)),
-    "trace": lambda P: np.trace(P),
+    "det": lambda P: np.asarray(np.linalg.det(np.moveaxis(P, -1, 0))),
+    "trace": lambda P: np.asarray(np.trace(P)),
 }
 
 
@@ -70,21 +70,58 @@ def test_an_element_does_not_depend_on_the_others() -> None:
         np.testing.assert_array_equal(one.covariance[..., 0], whole.covariance[..., i])
 
 
-def test_they_are_found_by_id_and_number() -> None:
+def ids(*numbers: int) -> Ids:
+    return np.array(numbers, dtype=np.uint64)
+
+
+def sources_of(*rows: int, count: int = 1) -> Ints:
+    return np.array(rows, dtype=np.intp)[:, None].repeat(count, axis=1)
+
+
+def test_they_are_found_by_id_and_source() -> None:
     kept = KeptWeights()
-    assert kept.of(np.array([1], dtype=np.uint64), 3) is None
-    kept.note(np.array([7, 3], dtype=np.uint64), np.array([[0.1, 0.2], [0.3, 0.4], [0.6, 0.4]]))
-    kept.note(np.array([5], dtype=np.uint64), np.full((2, 1), 0.5))
+    assert kept.of(ids(1), sources_of(0, 1, 2)) is None
+    kept.note(ids(7, 3), sources_of(0, 2, 5, count=2), np.array([[0.1, 0.2], [0.3, 0.4], [0.6, 0.4]]))
+    kept.note(ids(5), sources_of(0, 1), np.full((2, 1), 0.5))
+    kept.note(ids(8), sources_of(0, 1, 2), np.full((3, 1), np.nan))
     kept.turn()
     again = KeptWeights()
     again.restore(kept.packed())
     for one in (kept, again):
-        found = one.of(np.array([3, 4, 7, 9], dtype=np.uint64), 3)
+        found = one.of(ids(3, 4, 7, 8, 9), sources_of(0, 2, 5, count=5))
         assert found is not None
-        np.testing.assert_array_equal(found[0], [0.2, np.nan, 0.1, np.nan])
-        assert one.of(np.array([5], dtype=np.uint64), 2) is None
+        np.testing.assert_array_equal(found[0], [0.2, np.nan, 0.1, np.nan, np.nan])
+        assert one.of(ids(5), sources_of(0, 1)) is None
+
+
+def test_a_source_that_is_away_for_a_step_finds_its_weight_again() -> None:
+    kept = KeptWeights()
+    weights = np.array([[0.1], [0.3], [0.4], [0.2]])
+    kept.note(ids(7), sources_of(0, 2, 5, 6), weights)
     kept.turn()
-    assert kept.of(np.array([7], dtype=np.uint64), 3) is None
+    without = kept.of(ids(7), sources_of(0, 2, 5))
+    assert without is not None
+    np.testing.assert_allclose(without[:, 0], [0.125, 0.375, 0.5])
+    kept.note(ids(7), sources_of(0, 2, 5), without)
+    kept.turn()
+    np.testing.assert_array_equal(kept.of(ids(7), sources_of(0, 2, 5, 6)), weights)
+    other = kept.of(ids(7), sources_of(0, 2, 5, 9))
+    assert other is not None
+    np.testing.assert_allclose(other[:, 0], [0.125, 0.375, 0.5, 0.0])
+    few = kept.of(ids(7), sources_of(0, 6, 9))
+    assert few is not None
+    assert np.isnan(few).all()
+
+
+def test_what_is_not_used_is_forgotten() -> None:
+    kept = KeptWeights()
+    kept.note(ids(7), sources_of(0, 1, 2), np.full((3, 1), 1.0 / 3.0))
+    for _ in range(STEPS + 1):
+        kept.turn()
+        assert kept.of(ids(7), sources_of(0, 1, 2)) is not None
+    kept.turn()
+    assert kept.of(ids(7), sources_of(0, 1, 2)) is None
+    assert kept.packed() == []
 
 
 def scan(source: str, number: int, P: Floats, x: Floats) -> schemas.LocalTracks:

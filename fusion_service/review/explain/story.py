@@ -159,6 +159,8 @@ class Story:
                 self.say(at, f"the service began anew {'from its checkpoint' if kept else 'without a checkpoint'}")
             elif kind == "era":
                 self.say(at, "the clock was set back: a new era began")
+            elif kind == "revised" and sources & set(_listed(event.get("sources"))):
+                self.say(at, _revised(event, at))
             elif kind in ("found", "lost") and source in sources:
                 self.say(at, f"{source} {'is on the bus' if kind == 'found' else 'has left the bus'}")
             elif kind == "order" and (whom := self._concerned(event, sources)):
@@ -319,6 +321,13 @@ def _split_by_order(log: StepLog, track: int) -> bool:
     members = {(log.sources[s], i) for s, i in zip(one.source[mine].tolist(), one.id[mine].tolist(), strict=True)}
     locals_ = (_listed(event.get("local")) for event in _obeyed(log, "split"))
     return any(len(local) == 3 and (local[0], local[2]) in members for local in locals_)
+
+
+def _revised(event: dict[str, Any], at: int) -> str:
+    """What a step says of those that were made again before it."""
+    since, names = event.get("since"), ", ".join(map(str, _listed(event.get("sources"))[:3]))
+    back = f" from {(at - since) / 1e9:.1f} s before on" if isinstance(since, int) else ""
+    return f"made again{back}, with late data of {names}"
 
 
 def _change(before: int, status: int) -> str:
