@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, picked
 from fusion_service.centre.derived import MOST_MEMBERS, Followed
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.kept_weights import KeptWeights
@@ -173,9 +173,9 @@ def _part(
         return fuse_last(rule, means, covariances, influence=True, start=start, **options)
     whole = Fused(*(np.full((*shape, size), np.nan) for shape in ((n,), (n, n), (N,), (N,))))
     if len(at):
-        options |= {name: options[name][..., at] for name in EACH if name in options}
-        begin = None if start is None else start[:, at]
-        x, P = np.take(means, at, axis=-1), np.take(covariances, at, axis=-1)
+        options |= {name: picked(options[name], at) for name in EACH if name in options}
+        begin = None if start is None else picked(start, at)
+        x, P = picked(means, at), picked(covariances, at)
         part = fuse_last(rule, x, P, influence=True, start=begin, **options)
         for column, wide in zip(_columns(part), _columns(whole), strict=True):
             wide[..., at] = column

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, picked
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
@@ -87,8 +87,8 @@ def _gaussian(
 ) -> tuple[Floats, Floats, Floats, Ways]:
     """Means, covariances and gains of groups (B, k), and what each was fused by (see `Correlation.fuse`)."""
     config = known.config
-    means = np.ascontiguousarray(np.moveaxis(rows.tracks.mean[:, members], 2, 0))
-    covariances = np.ascontiguousarray(np.moveaxis(rows.tracks.covariance[:, :, members], 3, 0))
+    means = np.stack([picked(rows.tracks.mean, one) for one in members.T])
+    covariances = np.stack([picked(rows.tracks.covariance, one) for one in members.T])
     related = kinship.is_related(rows, members) & (config.rule not in kinship.ANY_CORRELATION)
     by = np.zeros(len(members), dtype=np.uint8)
     ruled = Ruled(rows, members, known, unknown, journal)

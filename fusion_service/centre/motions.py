@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Floats, Ints, picked
 from fusion_service.centre.align import predict_tracks
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
@@ -51,7 +51,7 @@ class States:
 
     def take(self, at: Any) -> States:
         """The given ones (indices or a mask)."""
-        return States(*(getattr(self, one.name)[..., at] for one in fields(self)))
+        return States(*(picked(getattr(self, one.name), at) for one in fields(self)))
 
 
 Kind = TypeVar("Kind", Picture, States)

@@ -125,18 +125,18 @@ class Conduct:
                 new[name][known] = old[name][place[known]]
         at = found.at
         before = self._before[source.name].tracks
-        first = before.time[np.searchsorted(before.id, tracks.id[at])]
-        new["since"][at] = np.where(found.again & (new["repeats"][at] > 0), new["since"][at], first)
-        ended, varied = new["repeats"][at] > 0, new["varied"][at]
+        first, ended, varied = before.time[found.was], new["repeats"][at] > 0, new["varied"][at]
+        new["since"][at] = np.where(found.again & ended, new["since"][at], first)
         new["repeats"][at] = np.where(found.again, new["repeats"][at] + 1, 0)
         new["varied"][at] = np.where(found.again, varied, np.where(ended, 1, varied + 1))
-        recent = time - new["last"] <= HOLD * 1e9
-        new["jumps"][~recent] = 0
+        if new["jumps"].any():
+            new["jumps"][time - new["last"] > HOLD * 1e9] = 0
         settled = (varied >= VARIED) | (new["jumps"][at] > 0) | (tracks.identity[at] != NONE)
         jumped = found.jumped & settled
-        new["varied"][at[found.jumped]] = 0
-        new["jumps"][at[jumped]] += 1
-        new["last"][at[jumped]] = time
+        if jumped.any() or found.jumped.any():
+            new["varied"][at[found.jumped]] = 0
+            new["jumps"][at[jumped]] += 1
+            new["last"][at[jumped]] = time
         record.columns = new
         if (new["repeats"][at] >= FEW).any():
             self._stuck(source, new, found, time, journal)
@@ -262,6 +262,9 @@ class Conduct:
     def _denied(self, rows: Rows, picture: Picture, entries: Entries) -> list[tuple[int, str, float, int]]:
         """Global tracks (their place) of one source alone, that other sources have missed: how surely, and how many
         of these there are."""
+        if len(entries.by_source) < 2:
+            self._alone = {}
+            return []
         names = self._intake.names()
         inside = rows.linked()
         count = len(picture.id)
@@ -270,7 +273,7 @@ class Conduct:
         np.minimum.at(low, at, rows.source[inside])
         np.maximum.at(high, at, rows.source[inside])
         alone = (low == high) & (high >= 0)
-        if not alone.any() or len(entries.by_source) < 2:
+        if not alone.any():
             self._alone = {}
             return []
         total, others = np.zeros(count), np.zeros(count, dtype=np.intp)

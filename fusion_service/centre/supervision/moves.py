@@ -52,7 +52,7 @@ class Snapshot(NamedTuple):
 class Moves(NamedTuple):
     """Of the K new versions, in order of id: at (K,), their place in the table; again (K,), as before to the bit;
     speed (K,), m/s, what they claim, 0 where they claim none; sigma (K,), m, of the place; jumped (K,); away (K,), m,
-    from where the last one led."""
+    from where the last one led; was (K,): the place of that in the table before."""
 
     at: NDArray[np.intp]
     again: Bools
@@ -60,6 +60,7 @@ class Moves(NamedTuple):
     sigma: Floats
     jumped: Bools
     away: Floats
+    was: NDArray[np.intp]
 
 
 def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, config: CentreConfig) -> Moves:
@@ -67,7 +68,7 @@ def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, conf
     new = source.tracks
     none = np.zeros(0)
     whole = np.zeros(0, dtype=np.intp)
-    nothing = Moves(whole, none > 0, none, none, none > 0, none)
+    nothing = Moves(whole, none > 0, none, none, none > 0, none, whole)
     if (old.epoch, old.space, old.frame) != (source.epoch, source.space, frame) or not len(old.tracks.id):
         return nothing
     before = old.tracks
@@ -108,11 +109,15 @@ def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, conf
     moved = np.sqrt(away)
     far = SIGMAS * np.sqrt(spread) + TIMES * config.manoeuvre * dt * dt / 2
     held = dt <= PAUSE * np.maximum(before.interval[was], 1) / 1e9
-    return Moves(at, again, np.sqrt(speed), np.sqrt(sigma), held & (moved > far) & np.isfinite(far), moved)
+    return Moves(at, again, np.sqrt(speed), np.sqrt(sigma), held & (moved > far) & np.isfinite(far), moved, was)
 
 
 def _later(before: Tracks, new: Tracks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """The new versions (K,) in a table, with a newer measurement, and what they follow in the table before."""
+    if len(before.id) == len(new.id) and np.array_equal(before.id, new.id):
+        later = (new.time > before.time) & (new.updated > before.updated) & (before.origin == new.origin)
+        at = np.flatnonzero(later)
+        return at, at
     place = np.minimum(np.searchsorted(before.id, new.id), len(before.id) - 1)
     later = (before.id[place] == new.id) & (new.time > before.time[place]) & (new.updated > before.updated[place])
     at = np.flatnonzero(later & (before.origin[place] == new.origin))
