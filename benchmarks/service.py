@@ -31,8 +31,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
 import schemas
 from benchmarks.load import FRAME, SPACE, Load, World
@@ -115,6 +113,7 @@ class Report:
     memory: tuple[float, float] = (0.0, 0.0)
     missing: int = 0
     doubled: int = 0
+    mixed: int = 0
     looked: int = 0
     uneven: int = 0
     lost: dict[str, int] = field(default_factory=dict)
@@ -123,7 +122,8 @@ class Report:
         """In lines."""
         whole = (
             f"{self.uneven} pictures with another number of tracks than there are targets; "
-            f"of {self.looked} looked at: {self.missing} targets missing, {self.doubled} doubled"
+            f"of {self.looked} looked at: {self.missing} targets missing, {self.doubled} doubled, "
+            f"{self.mixed} tracks of several or away"
         )
         cpu = ", ".join(f"{name} {share:.2f}" for name, share in self.cpu.items())
         return "\n".join(
@@ -150,8 +150,8 @@ def _service(path: str, stop: threading.Event) -> None:
 
 
 def _clients(endpoint: str, way: Way, begin: multiprocessing.Queue[Any], sent: multiprocessing.Queue[Any]) -> None:
-    """All sources: a scan of each at its time, one after the other; when each was published, and how many bytes. Says
-    that it is there, and is told when to begin."""
+    """All sources: a scan of each at its time, their phases spread over the time between two; when each was published,
+    and how many bytes. Says that it is there, and is told when to begin."""
     load, world = way.load, way.load.world()
     note: list[tuple[str, int, int, int]] = []
     with open_bus([endpoint]) as bus:
@@ -161,11 +161,10 @@ def _clients(endpoint: str, way: Way, begin: multiprocessing.Queue[Any], sent: m
         sent.put([])
         start = begin.get(timeout=60.0)
         for number, at in enumerate(way.burst.times(load.rate, way.seconds)):
-            due = start + round(at * 1e9)
             for s in range(load.sources):
-                message = world.at(s, number, due, start)
-                data = schemas.encode(message)
-                if s == 0 and (wait := (due - time.time_ns()) / 1e9) > 0:
+                due = start + round((at + s / load.sources / load.rate) * 1e9)
+                data = schemas.encode(message := world.at(s, number, due, start))
+                if (wait := (due - time.time_ns()) / 1e9) > 0:
                     time.sleep(wait)
                 note.append((message.source, message.seq, time.time_ns(), len(data)))
                 out[s].put(data)
@@ -219,7 +218,7 @@ class _Sink:
         self.taken: list[tuple[int, str, int]] = []
         self.lost: Counter[str] = Counter()
         self.statuses: list[schemas.Status] = []
-        self.looked = self.missing = self.doubled = self.uneven = 0
+        self.looked = self.missing = self.doubled = self.mixed = self.uneven = 0
 
     def note(self, _key: str, data: bytes) -> None:
         """A callback of the bus."""
@@ -258,8 +257,9 @@ class _Sink:
         self.uneven += len(picture.ids) != self._way.load.targets
         if (picture.time - begin) / 1e9 * LOOKED >= self._looked:
             self._looked += 1
-            missing, doubled = _compared(picture, self._world, self.start)
+            missing, doubled, mixed = _compared(picture, self._world, self.start)
             self.looked, self.missing, self.doubled = self.looked + 1, self.missing + missing, self.doubled + doubled
+            self.mixed += mixed
 
 
 @contextmanager
@@ -353,18 +353,24 @@ def _evaluated(report: Report, way: Way, start: int, notes: list[tuple[str, int,
         report.skipped = sink.statuses[-1].step_time.get("skipped", 0.0)
         steps = [1e3 * one.step_time["last"] for one in sink.statuses if one.sent >= begin]
         report.step = {"median": float(np.median(steps or [np.nan])), "max": 1e3 * sink.statuses[-1].step_time["max"]}
-    report.looked, report.missing, report.doubled = sink.looked, sink.missing, sink.doubled
+    report.looked, report.missing, report.doubled, report.mixed = sink.looked, sink.missing, sink.doubled, sink.mixed
 
 
-def _compared(picture: schemas.GlobalTracks, world: World, start: int) -> tuple[int, int]:
-    """Targets that a picture does not have, and tracks that it has beyond one of each."""
-    truth = world.truth(picture.time - start)[:, :2]
-    if not len(picture.ids):
-        return len(truth), 0
-    reach: NDArray[np.float64] = 0.5 * np.full(len(picture.ids), world.load.spacing)
-    far, nearest = cKDTree(truth).query(picture.means[:, :2])
-    count = np.bincount(nearest[far < reach], minlength=len(truth))
-    return int((count == 0).sum()), int(np.maximum(count - 1, 0).sum()) + int((far >= reach).sum())
+def _compared(picture: schemas.GlobalTracks, world: World, start: int) -> tuple[int, int, int]:
+    """Targets that a picture does not have; tracks beyond the first of a target; tracks of more targets than one, or
+    half the spacing of targets away from theirs."""
+    count = world.load.targets
+    track = np.repeat(np.arange(len(picture.ids)), picture.contributor_counts)
+    target = picture.contributor_id.astype(np.intp) - 1
+    first = np.full(len(picture.ids), -1)
+    first[track[::-1]] = target[::-1]
+    mixed = np.zeros(len(picture.ids), dtype=np.bool_)
+    mixed[track[first[track] != target]] = True
+    there = first >= 0
+    held = np.bincount(first[there], minlength=count)
+    away = world.truth(picture.time - start)[first, :2] - picture.means[:, :2]
+    mixed |= there & (np.hypot(*away.T) > 0.5 * world.load.spacing)
+    return int((held == 0).sum()), int(np.maximum(held - 1, 0).sum() + (~there).sum()), int(mixed.sum())
 
 
 def setting(text: str) -> tuple[str, Any]:

@@ -117,6 +117,7 @@ class Centre(ABC):
             self._begin_era(era, received)
         if isinstance(event, Skipped):
             self._journal.event({"kind": "skipped", "steps": event.steps})
+            self._history.behind()
         elif not isinstance(event, (ClockSet, NewEra)):
             self._intake.put(event, received)
             self._history.note(event, received)
@@ -200,6 +201,8 @@ class Centre(ABC):
     def _revise(self) -> int | None:
         """Make the steps again that late data belong to. The time of the first that they change, ns; None: nothing is
         made again."""
+        if self._intake.lossy:
+            self._history.behind()
         late = self._history.find(self._intake, self._time) if self._history.on else []
         start = self._history.start(late) if self._history.on else None
         if start is None:

@@ -50,6 +50,8 @@ RECENT = 3
 """Newest states that are kept while data come late."""
 JUST = 1_000_000
 """ns: on arrival, a scan of that much before the newest step belongs to it as much as to one of its own."""
+CALM = 2_000_000_000
+"""ns after the newest sign that the centre is behind."""
 BUSY = 20
 """Steps for which they are kept after the last late message."""
 MOST_STEPS = 2000
@@ -108,6 +110,7 @@ class History:
         self.reordered: Counter[str] = Counter()
         self.revised = 0
         self._credit = 0.0
+        self._calm = -1
         self._busy = 0
         self._size = 0
         self._owed: dict[Key, int] = {}
@@ -137,7 +140,7 @@ class History:
 
     def clear(self) -> None:
         """Nothing that was made so far is made again."""
-        self.past, self._owed, self._size, self._credit = [], {}, 0, 0.0
+        self.past, self._owed, self._size, self._credit, self._calm = [], {}, 0, 0.0, -1
 
     def find(self, intake: Intake, last: int) -> list[Late]:
         """The queued messages that a step until `last`, ns, should have taken, and that would be taken now."""
@@ -157,6 +160,11 @@ class History:
                 found[key] = Late(key, due, event, received)
         return list(found.values())
 
+    def behind(self) -> None:
+        """Steps were skipped, or data dropped: for `CALM` no step is made again, which would only cost more of them.
+        What comes late in that time is used as it comes."""
+        self._calm, self._owed = (self.past[-1].time if self.past else 0) + CALM, {}
+
     def start(self, late: Sequence[Late]) -> int | None:
         """The step in `past` from which steps are to be made again for these and what is owed, None where nothing is.
         Call it once a step."""
@@ -170,7 +178,7 @@ class History:
         dues = [one.due for one in late if one.due > floor] + list(self._owed.values())
         if late:
             self._busy = self.past[-1].number + BUSY
-        if not dues:
+        if not dues or self.past[-1].time < self._calm:
             return None
         at = bisect_left(self.past, min(dues), key=lambda one: one.time)
         start = max(i for i in range(first, at + 1) if self.past[i].state is not None)
@@ -243,7 +251,7 @@ class History:
         self._trim(one.time - self._window)
 
     def _owe(self, key: Key, due: int, before: int) -> None:
-        if before >= 0 and due <= before - self._just and len(self._owed) < MOST_OWED:
+        if before >= self._calm and before >= 0 and due <= before - self._just and len(self._owed) < MOST_OWED:
             self._owed[key] = due
 
     def _trim(self, oldest: int) -> None:

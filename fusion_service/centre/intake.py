@@ -146,6 +146,11 @@ class Intake:
                 waiting[reason] += count
         return waiting
 
+    @property
+    def lossy(self) -> bool:
+        """Whether data were dropped since the last step."""
+        return any(dropped for _, _, dropped in self._refused)
+
     def names(self) -> tuple[str, ...]:
         """All sources, sorted."""
         return tuple(sorted(self.sources))

@@ -13,4 +13,4 @@ def test_every_picture_is_whole_and_nothing_is_lost() -> None:
     assert not report.lost
     assert report.pictures > 5
     assert report.looked > 2
-    assert (report.uneven, report.missing, report.doubled) == (0, 0, 0)
+    assert (report.uneven, report.missing, report.doubled, report.mixed) == (0, 0, 0, 0)

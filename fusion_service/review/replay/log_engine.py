@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_service.centre import Event, NewEra, Refused, SourceFound, SourceLost, order_of
+from fusion_service.centre import Event, NewEra, Refused, Skipped, SourceFound, SourceLost, order_of
 from fusion_service.config import config_hash
 from fusion_service.recording.steps import PATIENCE, Step, Steps
 from fusion_service.review.replay.engine import OnStep
@@ -203,6 +203,8 @@ def _events(log: StepLog) -> list[Event]:
         kind, source = event.get("kind"), event.get("source")
         if kind in ("found", "lost") and isinstance(source, str):
             events.append((SourceFound if kind == "found" else SourceLost)(source))
+        elif kind == "skipped" and isinstance(event.get("steps"), int):
+            events.append(Skipped(event["steps"]))
         elif kind == "era" and isinstance(event.get("time"), int):
             events.append(NewEra(event["time"]))
         elif (order := order_of(event)) is not None:
