@@ -13,14 +13,14 @@ from typing import Self
 
 import numpy as np
 
-from fusion_service.arrays import Bools, Floats
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.linalg import inner
 from fusion_service.rules.base.block import Result, Sources, weighted_product
 from fusion_service.rules.base.matrices import diagonal, weighted_sum
 from fusion_service.rules.base.options import CRITERION
 from fusion_service.rules.base.rule import Rule
 from fusion_service.rules.base.scales import SCALES, in_scales
-from fusion_service.rules.weights import simplex
+from fusion_service.rules.weights import active, simplex
 from fusion_service.rules.weights.pairs import is_one, of_elements
 from fusion_service.rules.weights.two import best_of_two
 
@@ -28,6 +28,8 @@ __all__ = ["KEPT", "RULE", "ci", "intersection"]
 
 KEPT = 1e-3
 """Weights that are given to start from are kept while their gap is at most this."""
+NEARER = 1e-6
+"""Else better ones are sought from there, until their gap is at most this."""
 
 
 def ci(sources: Sources, weights: Floats | None, influence: bool, *, criterion: str) -> Result:
@@ -62,7 +64,7 @@ def intersection(
         ends = (A[:, :, 1], A[:, :, 0]), (P[:, :, 1], P[:, :, 0]), (dets[1], dets[0])
         w = best_of_two(criterion, *ends, rho=rho)
     elif optimise:
-        w = simplex.best_weights(criterion, model, w)
+        w = _best(criterion, model, w)
     return _weighed(sources, model, w, influence, criterion, optimise)
 
 
@@ -81,19 +83,33 @@ def _weighed(
     return Result(mean, P, w, share, condition, gap)
 
 
+def _best(criterion: str, model: "Inflated", uniform: Floats, near: Floats | None = None) -> Floats:
+    """The best weights (N, B); a search that begins `near` them ends at a gap of `NEARER`."""
+    if uniform.dtype != np.float64:
+        return simplex.best_weights(criterion, model, uniform)
+    return active.best_weights(criterion, model, uniform, near, active.DONE if near is None else NEARER)
+
+
 def _from_start(sources: Sources, influence: bool, criterion: str, rho: float | Floats) -> Result:
-    """With the weights to start from where their gap is at most `KEPT`, they count as given; elsewhere with the best.
+    """With the weights to start from where their gap is at most `KEPT`, they count as given; elsewhere from there to
+    the best.
 
     The criterion, det P or trace P, is then at most exp(gap) times the smallest."""
     assert sources.start is not None
     result = _weighed(sources, Inflated(sources.information, rho), np.array(sources.start), influence, criterion, True)
-    kept = result.gap <= KEPT
-    result = replace(result, gap=np.where(kept, 0.0, result.gap))
-    anew = np.flatnonzero(~kept)
-    if len(anew):
-        some = sources.take(anew).without_start()
-        result.overwrite(anew, intersection(some, None, influence, criterion, of_elements(rho, anew)))
-    return result
+    anew = np.flatnonzero(~(result.gap <= KEPT))
+    if len(anew) == len(result.gap):
+        result = _nearer(sources, influence, criterion, rho)
+    elif len(anew):
+        result.overwrite(anew, _nearer(sources.take(anew), influence, criterion, of_elements(rho, anew)))
+    return replace(result, gap=np.where(result.gap <= KEPT, 0.0, result.gap))
+
+
+def _nearer(sources: Sources, influence: bool, criterion: str, rho: float | Floats) -> Result:
+    """With the best weights, sought from those to start from."""
+    model = Inflated(sources.information, rho)
+    w = _best(criterion, model, sources.uniform, sources.start)
+    return _weighed(sources, model, w, influence, criterion, True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,5 +138,9 @@ class Inflated:
             return None
         return diagonal(-self.scale(w)[2] * inner(G[:, :, None], self.A))
 
-    def take(self, index: Bools) -> Self:
+    def take(self, index: Bools | Ints) -> Self:
         return replace(self, A=self.A[..., index], rho=of_elements(self.rho, index))
+
+    def of(self, which: Ints) -> Self:
+        """The sources `which` (K, B), of each element its own."""
+        return replace(self, A=np.take_along_axis(self.A, which[None, None], axis=2))
