@@ -20,7 +20,7 @@ from fusion_service.rules.base.matrices import diagonal, weighted_sum
 from fusion_service.rules.base.options import CRITERION
 from fusion_service.rules.base.rule import Rule
 from fusion_service.rules.base.scales import SCALES, in_scales
-from fusion_service.rules.weights import active, simplex
+from fusion_service.rules.weights import active, pairs, simplex
 from fusion_service.rules.weights.pairs import is_one, of_elements
 from fusion_service.rules.weights.two import best_of_two
 
@@ -85,7 +85,8 @@ def _weighed(
 
 def _best(criterion: str, model: "Inflated", uniform: Floats, near: Floats | None = None) -> Floats:
     """The best weights (N, B); a search that begins `near` them ends at a gap of `NEARER`."""
-    if uniform.dtype != np.float64:
+    few = len(uniform) <= active.SETS[0] or (is_one(model.rho) and len(model.A) <= pairs.LIMIT)
+    if uniform.dtype != np.float64 or not few:  # of the others, too many have weight
         return simplex.best_weights(criterion, model, uniform)
     return active.best_weights(criterion, model, uniform, near, active.DONE if near is None else NEARER)
 

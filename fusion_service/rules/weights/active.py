@@ -25,15 +25,21 @@ DONE = 0.1 * simplex.GAP
 SETS = (4, 6, 6, 8, 8)
 """Of more sources, so many are looked at together, in round after round."""
 ROUNDS, EXCHANGES = 10, 12
-POWER = 4
+POWER = 2
 """Of the slopes, by which equal weights are multiplied to begin with."""
 NEAR = 1.0
 """Size of a step, in the metric of the second derivatives, up to which it is taken whole."""
+MIX = 0.05
+"""What each has at least when another round begins, so that none is held at zero by a wall."""
 RIDGE, SLACK = 1e-8, 1e-12
+"""Of the second derivatives, relatively; slope of what is held at zero that counts as none."""
 
 
 class Model(simplex.Model, Protocol):
     """A model of which some sources can be taken."""
+
+    def take(self, index: Bools | Ints) -> Self:
+        """The model of some elements of the batch."""
 
     def of(self, which: Ints) -> Self:
         """The model of the sources `which` (K, B) of each element: the others have no weight."""
@@ -44,27 +50,33 @@ def best_weights(
 ) -> Floats:
     """The best weights (N, B), as `simplex.best_weights`; `uniform` are equal ones (N, B).
 
-    `near`, any numbers (N, B), are begun with where they are weights; then a gap of `enough` ends the search.
+    `near`, any numbers (N, B), are begun with where they are weights; then a gap of `enough` ends the search. Where
+    equal weights are the best, they are given.
     """
-    w = uniform
+    w, good = np.array(uniform), np.zeros(uniform.shape[1], np.bool_)
+    usable = np.zeros_like(good)
     if near is not None:
         w = near / total(near)
-    fresh = np.flatnonzero(~(w.min(axis=0) >= 0.0) if near is not None else np.ones(w.shape[1], np.bool_))
+        usable = w.min(axis=0) >= 0.0
+    fresh = np.flatnonzero(~usable)
     if len(fresh):
-        w = np.array(w)
-        w[:, fresh] = _guess(criterion, model.take(fresh), uniform[:, fresh])
-    w, good = _improved(criterion, model, w, enough, near is not None)
+        w[:, fresh], good[fresh] = _guess(criterion, model.take(fresh), uniform[:, fresh])
+    for known, limit in ((True, enough), (False, DONE)):
+        some = np.flatnonzero(~good & (usable == known))
+        if len(some):
+            w[:, some], good[some] = _improved(criterion, model.take(some), w[:, some], limit, known)
     rest = np.flatnonzero(~good)
     if len(rest):
         w[:, rest] = simplex.best_weights(criterion, model.take(rest), uniform[:, rest])
     return w
 
 
-def _guess(criterion: str, model: Model, uniform: Floats) -> Floats:
-    """The more, the steeper the slope is at equal weights."""
-    w = uniform * _slopes(criterion, model, uniform) ** POWER
-    out: Floats = w / total(w)
-    return out
+def _guess(criterion: str, model: Model, w: Floats) -> tuple[Floats, Bools]:
+    """Weights (N, B), the larger, the steeper the slope is at equal weights `w`; these where they are the best (B,)."""
+    g = _slopes(criterion, model, w)
+    best = gap(w, g) <= DONE
+    steep = w * g**POWER
+    return np.where(best, w, steep / total(steep)), best
 
 
 def _slopes(criterion: str, model: Model, w: Floats) -> Floats:
@@ -76,13 +88,14 @@ def _improved(criterion: str, model: Model, start: Floats, enough: float, sparse
     """Weights (N, B) from `start`, most of which are zero where it is `sparse`, and whether their gap is at most
     `enough` (B,)."""
     N, size = start.shape
-    if N <= SETS[0]:
+    if SETS[0] >= N:
         return _newton(criterion, model, start, enough)
     out, good, todo, w = np.array(start), np.zeros(size, np.bool_), np.arange(size), start
     g = _slopes(criterion, model, w) if sparse else -w
     for most in SETS:
         which = np.lexsort((g, -w), axis=0)[:most]
         some = np.take_along_axis(w, which, axis=0)
+        some = some / total(some) + MIX * (most > SETS[0])
         some, _ = _newton(criterion, model.of(which), some / total(some), 0.5 * enough)
         w = np.zeros_like(w)
         np.put_along_axis(w, which, some, axis=0)
@@ -111,7 +124,7 @@ def _newton(criterion: str, model: Model, w: Floats, enough: float) -> tuple[Flo
         if len(busy) < len(todo):
             todo, model, w, g, V, D = todo[busy], model.take(busy), w[:, busy], g[:, busy], V[..., busy], D[..., busy]
         H = _curvature(criterion, model, w, V, D)
-        x = _minimum(H, g - matvec(H, w))
+        x = _minimum(H, g - matvec(H, w), w > 0.0)
         step = x - w
         size = np.sqrt(np.maximum(total(step * matvec(H, step)), 0.0))
         w = np.where(size <= NEAR, x, w + step / (1.0 + size))
@@ -145,18 +158,18 @@ def _curvature(criterion: str, model: Model, w: Floats, V: Floats, D: Floats) ->
     return H
 
 
-def _minimum(H: Floats, c: Floats) -> Floats:
-    """The x (N, B) >= 0 of sum 1 with the smallest c'x + x'Hx/2, for H (N, N, B) and c (N, B)."""
+def _minimum(H: Floats, c: Floats, free: Bools) -> Floats:
+    """The x (N, B) >= 0 of sum 1 with the smallest c'x + x'Hx/2, for H (N, N, B) and c (N, B); `free` (N, B): those
+    that may be positive."""
     if len(c) == 3:
         return _of_three(H, c)
     N = len(c)
     out, todo = np.empty_like(c), np.arange(c.shape[1])
-    free = np.ones(c.shape, np.bool_)
     for number in range(EXCHANGES):
         part = np.where(free[:, None] & free, H, 0.0)
         for i in range(N):
             part[i, i] += ~free[i]
-        a, b = linalg.solve(part, np.where(free, c, 0.0)), linalg.solve(part, free.astype(c.dtype))
+        a, b = _solved(part, np.where(free, c, 0.0), free.astype(c.dtype))
         nu = (1.0 + total(a)) / total(b)
         x = nu * b - a
         pull = c + matvec(H, x) - nu
@@ -171,6 +184,18 @@ def _minimum(H: Floats, c: Floats) -> Floats:
         todo, H, c = todo[busy], H[..., busy], c[:, busy]
         free = (free ^ wrong)[:, busy]
     return out
+
+
+def _solved(P: Floats, *columns: Floats) -> Floats:
+    """P^-1 x (N, B) of each column x."""
+    L, d = linalg.ldl(P)
+    y = np.stack(columns, axis=1)
+    for k in range(len(L) - 1):
+        y[k + 1 :] -= L[k + 1 :, k, None] * y[k]
+    y /= d[:, None]
+    for k in range(len(L) - 1, 0, -1):
+        y[:k] -= L[k, :k, None] * y[k]
+    return y.swapaxes(0, 1)
 
 
 def _of_three(H: Floats, c: Floats) -> Floats:

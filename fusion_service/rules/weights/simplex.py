@@ -18,7 +18,7 @@ from typing import Protocol, Self
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats
 from fusion_service.linalg import inner, product, total, trace
 from fusion_service.rules.base.matrices import diagonal
 
@@ -38,7 +38,7 @@ class Model(Protocol):
     def bend(self, w: Floats, G: Floats, /) -> Floats | None:
         """-tr(G d2M/dw_i dw_j) (N, N, B) for G >= 0: positive semidefinite. None where M is linear."""
 
-    def take(self, index: Bools | Ints) -> Self:
+    def take(self, index: Bools) -> Self:
         """The model of some elements of the batch."""
 
 
