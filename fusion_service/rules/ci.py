@@ -97,20 +97,18 @@ def _from_start(sources: Sources, influence: bool, criterion: str, rho: float | 
 
     The criterion, det P or trace P, is then at most exp(gap) times the smallest."""
     assert sources.start is not None
-    result = _weighed(sources, Inflated(sources.information, rho), np.array(sources.start), influence, criterion, True)
+    model, w = Inflated(sources.information, rho), np.array(sources.start)
+    result = _weighed(sources, model, w, influence, criterion, True)
     anew = np.flatnonzero(~(result.gap <= KEPT))
-    if len(anew) == len(result.gap):
-        result = _nearer(sources, influence, criterion, rho)
-    elif len(anew):
-        result.overwrite(anew, _nearer(sources.take(anew), influence, criterion, of_elements(rho, anew)))
+    if len(anew):
+        size = len(result.gap)
+        few = model if len(anew) == size else model.take(anew)
+        w[:, anew] = _best(criterion, few, sources.uniform[:, anew], w[:, anew])
+        if 2 * len(anew) > size:
+            result = _weighed(sources, model, w, influence, criterion, True)
+        else:
+            result.overwrite(anew, _weighed(sources.take(anew), few, w[:, anew], influence, criterion, True))
     return replace(result, gap=np.where(result.gap <= KEPT, 0.0, result.gap))
-
-
-def _nearer(sources: Sources, influence: bool, criterion: str, rho: float | Floats) -> Result:
-    """With the best weights, sought from those to start from."""
-    model = Inflated(sources.information, rho)
-    w = _best(criterion, model, sources.uniform, sources.start)
-    return _weighed(sources, model, w, influence, criterion, True)
 
 
 @dataclass(frozen=True, slots=True)

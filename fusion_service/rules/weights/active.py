@@ -60,15 +60,19 @@ def best_weights(
         usable = w.min(axis=0) >= 0.0
     fresh = np.flatnonzero(~usable)
     if len(fresh):
-        w[:, fresh], good[fresh] = _guess(criterion, model.take(fresh), uniform[:, fresh])
+        w[:, fresh], good[fresh] = _guess(criterion, _part(model, fresh, w), uniform[:, fresh])
     for known, limit in ((True, enough), (False, DONE)):
         some = np.flatnonzero(~good & (usable == known))
         if len(some):
-            w[:, some], good[some] = _improved(criterion, model.take(some), w[:, some], limit, known)
+            w[:, some], good[some] = _improved(criterion, _part(model, some, w), w[:, some], limit, known)
     rest = np.flatnonzero(~good)
     if len(rest):
         w[:, rest] = simplex.best_weights(criterion, model.take(rest), uniform[:, rest])
     return w
+
+
+def _part(model: Model, at: Ints, w: Floats) -> Model:
+    return model if len(at) == w.shape[1] else model.take(at)
 
 
 def _guess(criterion: str, model: Model, w: Floats) -> tuple[Floats, Bools]:
