@@ -57,7 +57,7 @@ def best_weights(
     usable = np.zeros_like(good)
     if near is not None:
         w = near / total(near)
-        usable = w.min(axis=0) >= 0.0
+        usable = (w.min(axis=0) >= 0.0) & (total(w) > 0.5)
     fresh = np.flatnonzero(~usable)
     if len(fresh):
         w[:, fresh], good[fresh] = _guess(criterion, _part(model, fresh, w), uniform[:, fresh])
@@ -208,18 +208,19 @@ def _of_three(H: Floats, c: Floats) -> Floats:
     far, side = H[0, 0] - H[0, 1], H[0, 0] - H[0, 2]
     p, q, r = p + far, q + side, r + far  # second derivatives, by y_1, y_2 and both
     b, d = c[1] - c[0] - far, c[2] - c[0] - side
-    out = np.zeros((3, 2, len(b)), c.dtype)  # of y, by edge
-    out[0, 0], out[1, 1], out[2, 1] = -b / p, -d / q, (b - d + p - r) / (p + q - 2.0 * r)
-    np.clip(np.where(np.isfinite(out), out, 0.0), 0.0, 1.0, out=out)
-    out[2, 0] = 1.0 - out[2, 1]
-    y, z = out[:, 0], out[:, 1]
+    t = np.stack([-b / p, -d / q, (b - d + p - r) / (p + q - 2.0 * r)])
+    t = np.clip(np.where(np.isfinite(t), t, 0.0), 0.0, 1.0)
+    edges = np.zeros((3, 3, len(b)), c.dtype)
+    for edge, (i, j) in enumerate(((0, 1), (0, 2), (1, 2))):
+        edges[i, edge], edges[j, edge] = 1.0 - t[edge], t[edge]
+    _, y, z = edges
     value = y * (b + 0.5 * p * y + r * z) + z * (d + 0.5 * q * z)
-    best, low = out[0], value[0]
+    best, low = edges[:, 0], value[0]
     for i in (1, 2):
         less = value[i] < low
-        best, low = np.where(less, out[i], best), np.where(less, value[i], low)
+        best, low = np.where(less, edges[:, i], best), np.where(less, value[i], low)
     det = p * q - r * r
     y, z = (r * d - q * b) / det, (r * b - p * d) / det
-    inside = (det > 0.0) & (y > 0.0) & (z > 0.0) & (y + z < 1.0)
-    best = np.where(inside, np.stack([y, z]), best)
-    return np.stack([np.maximum(1.0 - best[0] - best[1], 0.0), best[0], best[1]])
+    x = 1.0 - y - z
+    inside = (det > 0.0) & (y > 0.0) & (z > 0.0) & (x > 0.0)
+    return np.where(inside, np.stack([x, y, z]), best)
