@@ -61,10 +61,15 @@ def best_weights(
     fresh = np.flatnonzero(~usable)
     if len(fresh):
         w[:, fresh], good[fresh] = _guess(criterion, _part(model, fresh, w), uniform[:, fresh])
-    for known, limit in ((True, enough), (False, DONE)):
-        some = np.flatnonzero(~good & (usable == known))
+    many = np.count_nonzero(w, axis=0) >= SETS[0]
+    for which, limit, sets in (
+        (usable & ~many, enough, SETS),
+        (usable & many, enough, SETS[2:]),
+        (~usable & ~good, DONE, SETS),
+    ):
+        some = np.flatnonzero(which)
         if len(some):
-            w[:, some], good[some] = _improved(criterion, _part(model, some, w), w[:, some], limit, known)
+            w[:, some], good[some] = _improved(criterion, _part(model, some, w), w[:, some], limit, sets)
     rest = np.flatnonzero(~good)
     if len(rest):
         w[:, rest] = simplex.best_weights(criterion, model.take(rest), uniform[:, rest])
@@ -88,18 +93,19 @@ def _slopes(criterion: str, model: Model, w: Floats) -> Floats:
     return gradient(criterion, linalg.inverse(M), D)
 
 
-def _improved(criterion: str, model: Model, start: Floats, enough: float, sparse: bool) -> tuple[Floats, Bools]:
-    """Weights (N, B) from `start`, most of which are zero where it is `sparse`, and whether their gap is at most
-    `enough` (B,)."""
+def _improved(
+    criterion: str, model: Model, start: Floats, enough: float, sets: tuple[int, ...]
+) -> tuple[Floats, Bools]:
+    """Weights (N, B) from `start`, and whether their gap is at most `enough` (B,)."""
     N, size = start.shape
     if SETS[0] >= N:
         return _newton(criterion, model, start, enough)
     out, good, todo, w = np.array(start), np.zeros(size, np.bool_), np.arange(size), start
-    g = _slopes(criterion, model, w) if sparse else -w
-    for most in SETS:
+    g = _slopes(criterion, model, w)
+    for number, most in enumerate(sets):
         which = np.lexsort((g, -w), axis=0)[:most]
         some = np.take_along_axis(w, which, axis=0)
-        some = some / total(some) + MIX * (most > SETS[0])
+        some = some / total(some) + MIX * (number > 0)
         some, _ = _newton(criterion, model.of(which), some / total(some), 0.5 * enough)
         w = np.zeros_like(w)
         np.put_along_axis(w, which, some, axis=0)
