@@ -5,7 +5,7 @@
 The sources are fused as independent ones, with covariances inflated until the block-diagonal joint covariance bounds
 every admissible one. It is the geometric mean of the densities. Conservative whatever the correlation.
 
-Weights: min over w of det P or trace P, convex and found exactly (`pairs`, `line`, `simplex`).
+Weights: min over w of det P or trace P, convex and found exactly (`pairs`, `line`, `active`, `simplex`).
 """
 
 from dataclasses import dataclass, replace
