@@ -2,8 +2,8 @@
 
 Covariances change little from step to step, and so do the best weights of covariance intersection. Those that were last
 used are kept while their own certificate says that the criterion could be smaller by .1 % at most (`ci.KEPT`); else
-better ones are sought from there, a step or two of Newton's method, until it says .0001 % (`ci.NEARER`). Any weights give
-a conservative result: nothing that the rule promises depends on them.
+better ones are sought from there, a step or two of Newton's method, until it says .0001 % (`ci.NEARER`). Any weights
+give a conservative result: nothing that the rule promises depends on them.
 
 Of each global track that three rows or more feed, by source. Where other sources feed it than the last time (a row
 failed its gate in a step, and is back in the next), the last weights of the same ones are found, else those of them
