@@ -23,7 +23,6 @@ import os
 import tempfile
 import threading
 import time
-from collections import Counter, deque
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -33,7 +32,8 @@ from typing import Any
 import numpy as np
 
 import schemas
-from benchmarks.load import FRAME, SPACE, Load, World
+from benchmarks.load import FRAME, SPACE, Load
+from benchmarks.sink import Sink
 from fusion_service.bus import open_bus
 from fusion_service.bus.hub import run_hub
 from fusion_service.config import load_config
@@ -44,7 +44,6 @@ from fusion_service.service.daemon import run_service
 __all__ = ["Burst", "Report", "Way", "measure", "setting"]
 
 WARM = 3.0
-LOOKED = 2.0
 DRAIN = 3.0
 """Seconds for what is under way at the end."""
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -202,66 +201,6 @@ def floor(load: Load, scans: int = 5) -> float:
     return 1e3 * float(np.median(times)) * load.targets / few
 
 
-class _Sink:
-    """Pictures and logs as they come. Threads of the bus only append; one of its own looks at them."""
-
-    def __init__(self, way: Way) -> None:
-        self._way, self._world = way, way.load.world()
-        self._queue: deque[tuple[int, bytes]] = deque()
-        self._done = threading.Event()
-        self._thread = threading.Thread(target=self._work, daemon=True)
-        self._looked = 0
-        self.start = 2**62
-        self.arrived: dict[int, int] = {}
-        self.sizes: list[tuple[int, int, int]] = []
-        """Of each full picture when it came, its bytes, its tracks."""
-        self.taken: list[tuple[int, str, int]] = []
-        self.lost: Counter[str] = Counter()
-        self.statuses: list[schemas.Status] = []
-        self.looked = self.missing = self.doubled = self.mixed = self.uneven = 0
-
-    def note(self, _key: str, data: bytes) -> None:
-        """A callback of the bus."""
-        self._queue.append((time.time_ns(), data))
-
-    def __enter__(self) -> _Sink:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._done.set()
-        self._thread.join()
-
-    def _work(self) -> None:
-        while not self._done.wait(0.01) or self._queue:
-            while self._queue:
-                at, data = self._queue.popleft()
-                message = schemas.decode(data)
-                if isinstance(message, schemas.GlobalTracks):
-                    self._picture(at, len(data), message)
-                elif isinstance(message, schemas.StepLog):
-                    self.taken += [(message.time, entry.source, entry.seq) for entry in message.taken]
-                    for entry in (*message.refused, *message.dropped):
-                        self.lost[entry.reason] += max(entry.count, 1)
-                elif isinstance(message, schemas.Status):
-                    self.statuses.append(message)
-
-    def _picture(self, at: int, size: int, picture: schemas.GlobalTracks) -> None:
-        self.arrived[picture.time] = at
-        begin = self.start + round(WARM * 1e9)
-        if getattr(picture, "delta", False):
-            return
-        self.sizes.append((at, size, len(picture.ids)))
-        if not begin <= picture.time <= self.start + round(self._way.seconds * 1e9):
-            return
-        self.uneven += len(picture.ids) != self._way.load.targets
-        if (picture.time - begin) / 1e9 * LOOKED >= self._looked:
-            self._looked += 1
-            missing, doubled, mixed = _compared(picture, self._world, self.start)
-            self.looked, self.missing, self.doubled = self.looked + 1, self.missing + missing, self.doubled + doubled
-            self.mixed += mixed
-
-
 @contextmanager
 def _running(context: Any, target: Any, *arguments: Any) -> Iterator[Any]:
     stop = context.Event()
@@ -281,7 +220,7 @@ def measure(way: Way) -> Report:
     """Run it."""
     report = Report(floor=floor(way.load))
     context = multiprocessing.get_context("spawn")
-    endpoint, sink = free_endpoint(), _Sink(way)
+    endpoint, sink = free_endpoint(), Sink(way.load, way.seconds, WARM)
     begin: multiprocessing.Queue[Any] = context.Queue()
     sent: multiprocessing.Queue[Any] = context.Queue()
     there = threading.Event()
@@ -330,7 +269,7 @@ def _watch(report: Report, way: Way, start: int, processes: Mapping[str, Any]) -
     report.ratio = 1e3 * report.cpu["service"] * span / scans / report.floor
 
 
-def _evaluated(report: Report, way: Way, start: int, notes: list[tuple[str, int, int, int]], sink: _Sink) -> None:
+def _evaluated(report: Report, way: Way, start: int, notes: list[tuple[str, int, int, int]], sink: Sink) -> None:
     begin = start + round(WARM * 1e9)
     when = {(source, seq): at for source, seq, at, _ in notes}
     waits = [
@@ -354,23 +293,6 @@ def _evaluated(report: Report, way: Way, start: int, notes: list[tuple[str, int,
         steps = [1e3 * one.step_time["last"] for one in sink.statuses if one.sent >= begin]
         report.step = {"median": float(np.median(steps or [np.nan])), "max": 1e3 * sink.statuses[-1].step_time["max"]}
     report.looked, report.missing, report.doubled, report.mixed = sink.looked, sink.missing, sink.doubled, sink.mixed
-
-
-def _compared(picture: schemas.GlobalTracks, world: World, start: int) -> tuple[int, int, int]:
-    """Targets that a picture does not have; tracks beyond the first of a target; tracks of more targets than one, or
-    half the spacing of targets away from theirs."""
-    count = world.load.targets
-    track = np.repeat(np.arange(len(picture.ids)), picture.contributor_counts)
-    target = picture.contributor_id.astype(np.intp) - 1
-    first = np.full(len(picture.ids), -1)
-    first[track[::-1]] = target[::-1]
-    mixed = np.zeros(len(picture.ids), dtype=np.bool_)
-    mixed[track[first[track] != target]] = True
-    there = first >= 0
-    held = np.bincount(first[there], minlength=count)
-    away = world.truth(picture.time - start)[first, :2] - picture.means[:, :2]
-    mixed |= there & (np.hypot(*away.T) > 0.5 * world.load.spacing)
-    return int((held == 0).sum()), int(np.maximum(held - 1, 0).sum() + (~there).sum()), int(mixed.sum())
 
 
 def setting(text: str) -> tuple[str, Any]:
