@@ -55,9 +55,18 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
 
     Groups come in order of label within a size, rows in their own order within a group.
     """
+    if not len(labels):
+        return
     order = np.argsort(labels, kind="stable")
-    unique, starts, counts = np.unique(labels[order], return_index=True, return_counts=True)
-    for k in np.unique(counts):
+    ranked = labels[order]
+    starts = np.append(0, np.flatnonzero(ranked[1:] != ranked[:-1]) + 1)
+    counts = np.diff(starts, append=len(labels))
+    unique = ranked[starts]
+    sizes = np.flatnonzero(np.bincount(counts)).tolist()
+    if len(sizes) == 1:
+        yield unique, order.reshape(len(unique), sizes[0])
+        return
+    for k in sizes:
         chosen = counts == k
         yield unique[chosen], order[starts[chosen][:, None] + np.arange(k)]
 

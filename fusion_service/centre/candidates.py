@@ -8,13 +8,13 @@ with a track as that track is without the row's own source, so that no source vo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints, picked
+from fusion_service.arrays import Floats, Ints, among, picked
 from fusion_service.centre.association import overlap
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import Judgement
@@ -25,6 +25,7 @@ from fusion_service.centre.neighbours import Neighbours
 from fusion_service.centre.partial import Unknown, apart
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.densities import Mixtures
+from fusion_service.records import altered, columns_of
 
 __all__ = ["Candidates", "Pairs", "find_candidates"]
 
@@ -45,8 +46,10 @@ class Pairs:
     gate: Floats
 
     def take(self, some: NDArray[np.bool_] | Ints) -> Pairs:
-        """Those given."""
-        return Pairs(*(getattr(self, one.name)[some] for one in fields(self)))
+        """Those given; the same where a mask holds for all."""
+        if some.dtype == np.bool_ and some.all():
+            return self
+        return Pairs(*(column[some] for column in columns_of(self)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -102,8 +105,8 @@ def find_candidates(
     own = np.full(len(tracks.id), np.nan)
     mine = np.unique(rivals.first)
     own[mine] = lookup.cost(mine, now.find(tracks.link[mine]))
-    gg = replace(pairs_gg, first=known[pairs_gg.first], second=known[pairs_gg.second])
-    rr = replace(pairs_rr, first=node[pairs_rr.first], second=node[pairs_rr.second])
+    gg = altered(pairs_gg, first=known[pairs_gg.first], second=known[pairs_gg.second])
+    rr = altered(pairs_rr, first=node[pairs_rr.first], second=node[pairs_rr.second])
     return _said(Candidates(gg, joins, rivals, rr, own, loose, mean, covariance), rows, now, meeting)
 
 
@@ -113,8 +116,8 @@ def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candi
     own = near.own.copy()
     mine = np.flatnonzero(np.isfinite(own))
     own[mine] -= 2.0 * meeting.with_tracks(mine, now.find(rows.tracks.link[mine])).ratio
-    joins, rivals = (pairs.take(~np.isin(pairs.first, meeting.forced_row)) for pairs in (near.joins, near.rivals))
-    return replace(
+    joins, rivals = (pairs.take(~among(pairs.first, meeting.forced_row)) for pairs in (near.joins, near.rivals))
+    return altered(
         near,
         tracks=near.tracks.take(~meeting.of_tracks(near.tracks.first, near.tracks.second)),
         joins=_allowed(joins, meeting.with_tracks),
@@ -125,8 +128,10 @@ def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candi
 
 
 def _allowed(pairs: Pairs, say: Callable[[Ints, Ints], Terms]) -> Pairs:
+    if not len(pairs.first):
+        return pairs
     terms = say(pairs.first, pairs.second)
-    return replace(pairs, spread=pairs.spread - 2.0 * terms.ratio).take(~terms.forbidden)
+    return altered(pairs, spread=pairs.spread - 2.0 * terms.ratio).take(~terms.forbidden)
 
 
 class _Without:

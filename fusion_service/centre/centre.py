@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
-from fusion_service.centre.deltas import Deltas, fed
+from fusion_service.centre.deltas import Deltas
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
 from fusion_service.centre.events import Event, Refused, Skipped
 from fusion_service.centre.history import History, Past
@@ -152,7 +152,7 @@ class Centre(ABC):
             rule=self._rule,
             revised=revised,
         )
-        tracks = self._deltas.of(picture, fed(self._intake.sources.values()))
+        tracks = self._deltas.of(picture, self._intake.sources.values())
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         notes = self._era.notes(time)

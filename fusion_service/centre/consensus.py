@@ -105,40 +105,49 @@ def _of_groups(rows: Ints, means: Floats, covariances: Floats) -> tuple[Floats, 
 
 def _all_but_one(xs: list[Floats], Ps: list[Floats]) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:
     """Fusion of all k rows of B groups, and of all but each."""
-    k = len(xs)
-    swept = [linalg.sweep(P) for P in Ps]
-    least = swept[0][2]
-    for _, _, margin in swept[1:]:
-        least = np.minimum(least, margin)
-    information = [one[0] for one in swept]
-    vectors = [linalg.matvec(Y, x) for Y, x in zip(information, xs, strict=True)]
+    k, count = len(xs), xs[0].shape[1]
+    inverse, _, margins = linalg.sweep(np.concatenate(Ps, axis=2))
+    vector = linalg.matvec(inverse, np.concatenate(xs, axis=1))
+    each = [slice(j * count, (j + 1) * count) for j in range(k)]
+    least = margins[each[0]]
+    for part in each[1:]:
+        least = np.minimum(least, margins[part])
+    information, vectors = [inverse[..., part] for part in each], [vector[:, part] for part in each]
     right: list[tuple[Floats, Floats] | None] = [None] * k
     for j in range(k - 1, 0, -1):
         after = right[j] if j < k - 1 else None
         now = (information[j], vectors[j])
         right[j - 1] = now if after is None else (after[0] + now[0], after[1] + now[1])
     left: tuple[Floats, Floats] | None = None
-    without = []
+    sums = []
     for j in range(k):
         parts = [part for part in (left, right[j]) if part is not None]
-        Y, y = parts[0] if len(parts) == 1 else (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
-        chosen = [i for i in range(k) if i != j]
-        without.append(_inverted(Y, y, least, [xs[i] for i in chosen], [Ps[i] for i in chosen]))
+        sums.append(parts[0] if len(parts) == 1 else (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1]))
         left = (information[j], vectors[j]) if left is None else (left[0] + information[j], left[1] + vectors[j])
     assert left is not None
-    return _inverted(*left, least, xs, Ps), without
+    return _inverted([*sums, left], least, xs, Ps)
 
 
 def _inverted(
-    information: Floats, vector: Floats, least: Floats, xs: list[Floats], Ps: list[Floats]
-) -> tuple[Floats, Floats]:
-    """Mean and covariance of an equal-weight intersection of k sources, from their summed information."""
-    inverse, _, margin = linalg.sweep(information)
-    x, P = linalg.matvec(inverse, vector), inverse * float(len(xs))
-    sound = (np.minimum(least, margin) > SOUND) & np.isfinite(x).all(axis=0) & np.isfinite(P).all(axis=(0, 1))
-    bad = np.flatnonzero(~sound)
-    if len(bad):
-        x[:, bad], P[:, :, bad] = uniform_ci(
-            np.stack([one[:, bad] for one in xs]), np.stack([one[:, :, bad] for one in Ps])
-        )
-    return x, P
+    sums: list[tuple[Floats, Floats]], least: Floats, xs: list[Floats], Ps: list[Floats]
+) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:
+    """Means and covariances of equal-weight intersections of k sources, from their summed information: of all but each,
+    and the last of all. Inverted together: as many calls as for one."""
+    k, count = len(xs), xs[0].shape[1]
+    inverse, _, margin = linalg.sweep(np.concatenate([one for one, _ in sums], axis=2))
+    x = linalg.matvec(inverse, np.concatenate([one for _, one in sums], axis=1))
+    inverse[..., : k * count] *= float(k - 1)
+    inverse[..., k * count :] *= float(k)
+    sound = (np.minimum(np.tile(least, k + 1), margin) > SOUND) & np.isfinite(x).all(axis=0)
+    sound &= np.isfinite(inverse).all(axis=(0, 1))
+    out = []
+    for j in range(k + 1):
+        part = slice(j * count, (j + 1) * count)
+        one, P, bad = x[:, part], inverse[..., part], np.flatnonzero(~sound[part])
+        if len(bad):
+            chosen = [i for i in range(k) if i != j]
+            one[:, bad], P[:, :, bad] = uniform_ci(
+                np.stack([xs[i][:, bad] for i in chosen]), np.stack([Ps[i][:, :, bad] for i in chosen])
+            )
+        out.append((one, P))
+    return out[k], out[:k]

@@ -9,7 +9,7 @@ every source by the existence it reports. With recursive memory the predicted la
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,7 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.tracks import no_parts, padded
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures, reduce_mixtures
+from fusion_service.records import altered
 from fusion_service.rules import MIXTURE_RULES, RULES, Fused, fuse_last
 from fusion_service.rules.mixtures import fuse_mixtures_last
 from schemas import Entry
@@ -78,7 +79,7 @@ def fuse_all(
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
-    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
+    picture = altered(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
     return with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
 
 
@@ -140,7 +141,7 @@ class Ruled:
     def kin(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
         """Groups whose rows have data in common (see `kinship`): what is derived of rows holds for no result of
         them."""
-        ruled = replace(self, known=replace(self.known, followed=None, kept=None))
+        ruled = altered(self, known=altered(self.known, followed=None, kept=None))
 
         def by_rule(x: Floats, P: Floats, which: list[int], some: Ints) -> kinship.Estimates:
             return kinship.Estimates(*ruled.fuse(x, P, None, some, np.zeros(len(some), dtype=np.uint8), which))
@@ -237,7 +238,7 @@ def with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]])
         columns = no_parts(len(picture.mean), len(picture.id))
     else:
         columns = log_weight[:needed], means[:, :needed], covariances[:, :, :needed]
-    return replace(picture, log_weight=columns[0], part_mean=columns[1], part_covariance=columns[2])
+    return altered(picture, log_weight=columns[0], part_mean=columns[1], part_covariance=columns[2])
 
 
 def _influence(fused: Fused) -> Floats:

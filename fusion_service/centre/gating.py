@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, picked
+from fusion_service.arrays import Bools, Floats, Ints, among, picked
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -83,7 +83,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
     tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
     tracks.data[linked] += fresh
-    may = fresh & ~np.isin(linked, forced)
+    may = fresh & ~among(linked, forced)
     broken, was = _break(rows, linked, links, may, distance, predicted, tests, journal)
     stays = tracks.link[linked] != NO_TRACK
     shown = np.where(np.isnan(distance), np.where(outside, predicted, np.nan), distance)
@@ -98,7 +98,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
 def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensus:
     """What the rows `inside` say together, from what all of `had` said: only tracks that lost one are fused anew."""
     tracks = rows.tracks
-    kept = np.isin(had, inside)
+    kept = among(had, inside)
     links = tracks.link[inside]
     labels, group = np.unique(links, return_inverse=True)
     at = np.searchsorted(agreed.labels, labels)
@@ -145,7 +145,9 @@ def _worst(
     """Of the bad rows of each global track with new data the one to leave out: farthest from the others, then from
     the prediction, then youngest, then last in order."""
     at = np.flatnonzero(bad)
-    at = at[np.isin(links[at], links[fresh])]
+    if not len(at):
+        return at
+    at = at[among(links[at], links[fresh])]
     if not len(at):
         return at
     order = np.lexsort((-at, -since[at], -predicted[at], -distance[at], links[at]))
@@ -196,7 +198,7 @@ def _break(
     worst = _worst(links, may, predicted, shown, tracks.since[linked], ripe)
     if len(worst):
         journal.broke(rows, linked[worst], links[worst], shown[worst])
-        again = np.isin(links, links[worst])
+        again = among(links, links[worst])
         tracks.evidence[linked[again]] = np.maximum(tracks.evidence[linked[again]], 0.0)
         set_links(tracks, linked[worst], NO_TRACK, -1)
     return linked[worst], links[worst]

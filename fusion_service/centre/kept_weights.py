@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints, from_bytes, to_bytes
+from fusion_service.arrays import Floats, Ints, among, from_bytes, to_bytes
 
 __all__ = ["STEPS", "Ids", "KeptWeights"]
 
@@ -88,7 +88,7 @@ class KeptWeights:
         after = {count: parts[0].join(*parts[1:]) for count, parts in self._next.items()}
         for count, old in self._last.items():
             new = after.get(count)
-            stays = old.age < STEPS if new is None else (old.age < STEPS) & ~np.isin(old.id, new.id)
+            stays = old.age < STEPS if new is None else (old.age < STEPS) & ~among(old.id, new.id)
             if stays.any():
                 kept = old.take(stays)
                 kept = _Kept(kept.id, kept.source, kept.weight, kept.age + 1)

@@ -10,7 +10,6 @@ one.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, among
 from fusion_service.centre.births import group, locals_of
 from fusion_service.centre.candidates import Candidates, find_candidates
 from fusion_service.centre.copies import Copies
@@ -34,6 +33,7 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.tracks import set_links
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import assign_near
+from fusion_service.records import altered
 from schemas import Entry, messages
 
 __all__ = ["Linker"]
@@ -151,7 +151,7 @@ class Linker:
         value = np.concatenate([worth, STANDING + sums, stay])
         stays = np.arange(len(row)) >= len(row) - len(standing)
         free = ~touched[track] | stays
-        held = np.isin(row, standing[touched[at]])
+        held = among(row, standing[touched[at]])
         free &= ~held & (value > 0)
         own = tracks.link[row] == now.id[track]
         free &= stays | ~own
@@ -186,7 +186,7 @@ class Linker:
             chosen = now.id[track] == link
             gained = np.zeros(len(rows.source))
             gained[row[chosen]] = value[chosen]
-            value = np.clip(np.where(np.isin(row, moved), value - gained[row], value), -LOW, MOST_RIVAL)
+            value = np.clip(np.where(among(row, moved), value - gained[row], value), -LOW, MOST_RIVAL)
             row, track, value = row[~chosen], track[~chosen], value[~chosen]
         # rows without a new datum keep what they had
         old_row, old_track, old = self.rivals.known(rows, now)
@@ -202,7 +202,7 @@ class Linker:
         tracks, tests = rows.tracks, self.tests
         if not len(free):
             return np.zeros(0, dtype=np.bool_)
-        joins = near.joins.take(np.isin(near.joins.first, free))
+        joins = near.joins.take(among(near.joins.first, free))
         holds = _held(rows, now, joins.first, joins.second)
         joins = joins.take(holds)
         order = np.lexsort((joins.distance + joins.spread, joins.first))
@@ -303,7 +303,7 @@ class Linker:
 def _vacant(near: Candidates, meeting: Meeting) -> Candidates:
     """Without the pairs whose place another row has by order."""
     joins, rivals = (pairs.take(~meeting.taken(pairs.first, pairs.second)) for pairs in (near.joins, near.rivals))
-    return replace(near, joins=joins, rivals=rivals)
+    return altered(near, joins=joins, rivals=rivals)
 
 
 def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgement) -> Candidates:
@@ -313,7 +313,7 @@ def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgemen
     was = np.zeros(len(rows.source), dtype=np.uint64)
     was[judged.broken] = judged.was
     joins = near.joins.take(was[near.joins.first] != now.id[near.joins.second])
-    return replace(near, joins=joins)
+    return altered(near, joins=joins)
 
 
 def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
@@ -323,14 +323,14 @@ def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
     inside = rows.inside()
     width = max(len(now.id), 1)
     keys = np.unique(rows.source[inside] * width + now.find(rows.tracks.link[inside]))
-    return np.isin(rows.source[row] * width + track, keys)
+    return among(rows.source[row] * width + track, keys)
 
 
 def _holders(rows: Rows, now: Picture, wanted: Ints, name: int) -> Ints:
     """The rows of the source that stand in a track that another row of it may join or exchange its own for."""
     ids = np.unique(now.id[wanted])
     mine = np.flatnonzero((rows.source == name) & (rows.tracks.link != NO_TRACK))
-    return mine[np.isin(rows.tracks.link[mine], ids)]
+    return mine[among(rows.tracks.link[mine], ids)]
 
 
 def _in_clusters(row: Ints, track: Ints, reason: Ints, rows: int, tracks: int) -> Bools:
@@ -339,7 +339,7 @@ def _in_clusters(row: Ints, track: Ints, reason: Ints, rows: int, tracks: int) -
         return np.zeros(0, dtype=np.bool_)
     graph = coo_array((np.ones(len(row), dtype=np.int8), (row, rows + track)), (rows + tracks, rows + tracks))
     part = connected_components(graph, directed=False)[1]
-    return np.isin(part[row], part[reason])
+    return among(part[row], part[reason])
 
 
 def _distance_of(near: Candidates, row: Ints, track: Ints) -> Floats:

@@ -5,15 +5,17 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import among
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
 from fusion_service.centre.places import Place, followed
 from fusion_service.centre.tracks import Pair, Tracks, by_id, empty_tracks, join_tracks, renewed
+from fusion_service.records import altered
 from schemas import LocalTracks, SensorInfo
 
 __all__ = ["REMEMBERED", "Source"]
@@ -123,12 +125,12 @@ class Source:
         space, complete, end = messages[-1].space, messages[-1].complete, messages[-1].time
         new = by_id(new.take(new.time >= self.complete))
         old = self.tracks if space == self.space else empty_tracks(len(space))
-        new = replace(new, interval=intervals(new.id, new.time, self._known(old), pace))
+        new = altered(new, interval=intervals(new.id, new.time, self._known(old), pace))
         merged, stays, pair = renewed(old, new, versions)
         gone = old.link[:0]
         if complete and end >= self.complete and stays.any():
             listed = ~stays | (old.time > end)
-            listed[~listed] = np.isin(old.id[~listed], messages[-1].ids)
+            listed[~listed] = among(old.id[~listed], messages[-1].ids)
             stays, gone = stays & listed, old.link[~listed]
         if stays.any():
             merged = join_tracks([old.take(stays), merged])
