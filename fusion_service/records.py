@@ -28,10 +28,12 @@ def _reader(kind: Any) -> Callable[[Any], tuple[Any, ...]]:
 
 def columns_of(record: Any) -> tuple[Any, ...]:
     """The values of the fields of a dataclass, in order: those themselves, no copies."""
-    return _reader(type(record))(record)
+    kind: Any = type(record)
+    return _reader(kind)(record)
 
 
 def altered(record: Record, /, **new: Any) -> Record:
     """The same with other values of these fields: `dataclasses.replace`."""
-    kind = type(record)
-    return kind(**{**dict(zip(names_of(kind), columns_of(record), strict=True)), **new})
+    kind: Any = type(record)
+    made: Record = kind(**{**dict(zip(names_of(kind), columns_of(record), strict=True)), **new})
+    return made

@@ -26,7 +26,8 @@ SOUND = 1e-8
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
     """Of M rows in G groups: mean (n, G) and covariance (n, n, G) of all rows of each group; others_mean (n, M) and
-    others_covariance (n, n, M) of the group without the row (NaN where it is alone); size (M,) of its group."""
+    others_covariance (n, n, M) of the group without the row (NaN where it is alone); size (M,) of its group; groups:
+    rows (g, k) of the groups of each size k (left empty where some were made anew)."""
 
     labels: NDArray[np.uint64]
     mean: Floats
@@ -34,6 +35,7 @@ class Consensus:
     others_mean: Floats
     others_covariance: Floats
     size: Ints
+    groups: list[Ints]
 
 
 def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) -> Consensus:
@@ -42,14 +44,15 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
     All but one: sums of information from the left and from the right of each row, so N rows cost 2 N sums and not N^2.
     """
     n, count = means.shape
-    unique = np.unique(labels)
+    sized = list(by_size(labels))
+    unique = sized[0][0] if len(sized) == 1 else np.sort(np.concatenate([labels[:0], *(names for names, _ in sized)]))
     mean, covariance = np.empty((n, len(unique))), np.empty((n, n, len(unique)))
     partner = np.full(count, -1)
     size = np.ones(count, dtype=np.intp)
     more: list[tuple[Ints, Floats, Floats]] = []
     others = np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
-    for names, rows in by_size(labels):
-        at = np.searchsorted(unique, names)
+    for names, rows in sized:
+        at = slice(None) if len(sized) == 1 else np.searchsorted(unique, names)
         k = rows.shape[1]
         size[rows] = k
         if k == 1:
@@ -74,7 +77,7 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
         others[0][:, paired], others[1][:, :, paired] = means[:, partner[paired]], covariances[:, :, partner[paired]]
     for one, x, P in more:
         others[0][:, one], others[1][:, :, one] = x, P
-    return Consensus(unique, mean, covariance, *others, size)
+    return Consensus(unique, mean, covariance, *others, size, [rows for _, rows in sized])
 
 
 def _compiled(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, picked
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
@@ -88,12 +88,15 @@ def _gaussian(
 ) -> tuple[Floats, Floats, Floats, Ways]:
     """Means, covariances and gains of groups (B, k), and what each was fused by (see `Correlation.fuse`)."""
     config = known.config
-    means = np.stack([picked(rows.tracks.mean, one) for one in members.T])
-    covariances = np.stack([picked(rows.tracks.covariance, one) for one in members.T])
-    related = kinship.is_related(rows, members) & (config.rule not in kinship.ANY_CORRELATION)
+    # in memory (n, k, B): as the rules have it
+    means = rows.tracks.mean.take(members.T, axis=-1).transpose(1, 0, 2)
+    covariances = rows.tracks.covariance.take(members.T, axis=-1).transpose(2, 0, 1, 3)
+    related = np.zeros(len(members), dtype=np.bool_)
+    if config.rule not in kinship.ANY_CORRELATION:
+        related = kinship.is_related(rows, members)
     by = np.zeros(len(members), dtype=np.uint8)
     ruled = Ruled(rows, members, known, unknown, journal)
-    if related.all():
+    if len(related) and related.all():
         one, spread, gains = ruled.kin(means, covariances)
     else:
         weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None

@@ -78,7 +78,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep[shared])
     outside[failed] = True
     agreement, jump = tests.agreement(distance, shared), tests.jump(predicted, seen)
-    _weigh(rows, linked, agreement, jump, jumped, agreed.size, some, tests.bound)
+    _weigh(rows, linked, agreement, jump, jumped, agreed.groups, agreed.size, some, tests.bound)
     tracks.outside[linked] = outside
     tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
     tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
@@ -112,7 +112,7 @@ def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensu
     mean[:, changed], covariance[:, :, changed] = anew.mean, anew.covariance
     others_mean[:, fewer], others_covariance[:, :, fewer] = anew.others_mean, anew.others_covariance
     size[fewer] = anew.size
-    return Consensus(labels, mean, covariance, others_mean, others_covariance, size)
+    return Consensus(labels, mean, covariance, others_mean, others_covariance, size, [])
 
 
 def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings) -> tuple[Floats, Ints]:
@@ -156,12 +156,13 @@ def _worst(
 
 
 def _weigh(
-    rows: Rows, linked: Ints, agreement: Floats, jump: Floats, jumped: Bools, size: Ints, some: Ints, bound: float
-) -> None:
+    rows: Rows, linked: Ints, agreement: Floats, jump: Floats, jumped: Bools, groups: list[Ints], size: Ints,
+    some: Ints, bound: float,
+) -> None:  # fmt: skip
     """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
     tracks, fresh = rows.tracks, rows.fresh[linked]
     others = np.full(len(linked), -1, dtype=np.int64)
-    others[some] = _newest_other(tracks.link[linked[some]], tracks.updated[linked[some]])
+    others[some] = _newest_other(groups, tracks.updated[linked[some]])
     together = np.zeros(len(linked), dtype=np.bool_)
     together[some] = size > 1
     weighed = fresh & together & ~jumped & (others > tracks.weighed[linked])
@@ -172,17 +173,16 @@ def _weigh(
     tracks.weighed[linked] = np.where(weighed, others, tracks.weighed[linked])
 
 
-def _newest_other(links: NDArray[np.uint64], updated: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each row the newest datum of the other rows of its track, -1 without any."""
-    order = np.lexsort((updated, links))
-    last = np.append(links[order][1:] != links[order][:-1], True) if len(order) else np.zeros(0, dtype=np.bool_)
-    begins = np.append(True, last[:-1]) if len(order) else last
-    group = np.cumsum(begins) - 1
-    top = order[last]
-    newest = updated[top][group]
-    second = np.where(begins[last], -1, updated[order][np.flatnonzero(last) - 1])[group]
-    out = np.empty(len(order), dtype=np.int64)
-    out[order] = np.where(last, second, newest)
+def _newest_other(groups: list[Ints], updated: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each row the newest datum of the other rows of its track, -1 without any; groups as of `Consensus`."""
+    out = np.full(len(updated), -1, dtype=np.int64)
+    for members in groups:
+        if members.shape[1] == 2:
+            out[members] = updated[members[:, ::-1]]
+        elif members.shape[1] > 2:
+            when = updated[members]
+            second, newest = np.sort(when, axis=1)[:, -2:].T
+            out[members] = np.where(when == newest[:, None], second[:, None], newest[:, None])
     return out
 
 

@@ -67,6 +67,8 @@ class Meeting:
         """The rows whose standing links an order forbids, or another row of the track that is trusted to be another
         object. Of two rows that are never to be together the second leaves, unless it is linked by order."""
         linked, link, orders = self._rows.linked(), self._rows.tracks.link, self._orders
+        if not (len(orders.apart_i) or len(orders.forbidden_row)) and (self._rows.tracks.identity == NONE).all():
+            return linked[:0]
         together = (link[orders.apart_i] == link[orders.apart_j]) & (link[orders.apart_i] != NO_TRACK)
         i, j = orders.apart_i[together], orders.apart_j[together]
         leaves = np.where(among(j, self.forced_row), i, j)
@@ -107,6 +109,8 @@ class Meeting:
     def taken(self, row: Ints, at: Ints) -> Mask:
         """Of P pairs of a row and a global track (its place in `ids`), those whose place another row of the source has
         by order."""
+        if not len(self.forced_row):
+            return np.zeros(len(row), dtype=np.bool_)
         source, width = self._rows.source, max(len(self._ids), 1)
         keys = source[self.forced_row] * width + np.searchsorted(self._ids, self.forced_track)
         return among(source[row] * width + at, keys) & ~among(row, self.forced_row)

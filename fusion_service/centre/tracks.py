@@ -183,6 +183,8 @@ def unlinked(count: int) -> dict[str, NDArray[Any]]:
 
 def set_links(tracks: Tracks, at: NDArray[np.intp], link: NDArray[np.uint64] | np.uint64, step: int) -> None:
     """Give the tracks `at` a link in `step`, 0 for none, with nothing known of it yet. Writes the columns `LINKS`."""
+    if not len(at):
+        return
     for name, (_, blank) in _BLANK.items():
         if name not in OF_THE_TRACK:
             getattr(tracks, name)[at] = blank
