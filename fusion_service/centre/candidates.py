@@ -78,9 +78,10 @@ def find_candidates(
 ) -> Candidates:
     """All that may meet. now: the picture predicted to the step; beside: who was near in the last one."""
     tracks, agreed = rows.tracks, judged.agreed
-    mean, covariance = now.mean.copy(), now.covariance.copy()
-    at = now.find(agreed.labels)
-    mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
+    mean, covariance = agreed.mean, agreed.covariance
+    if len(agreed.labels) < len(now.id):
+        mean, covariance, at = now.mean.copy(), now.covariance.copy(), now.find(agreed.labels)
+        mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
     loose = np.flatnonzero(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
     known = np.flatnonzero(now.time >= 0)
     means, covariances = (mean, covariance) if len(known) == len(now.id) else (mean[:, known], covariance[..., known])

@@ -10,7 +10,6 @@ depend on the size of its batch: the same events give the same bytes.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
@@ -346,6 +345,6 @@ class Centre(ABC):
             source.tracks = replace(source.tracks, lineage=new[source.tracks.lineage])
 
     def _numbers(self) -> dict[str, int]:
-        kinds = Counter(self._picture.status.tolist())
-        counts = {name: kinds.get(code, 0) for code, name in enumerate(messages.STATUSES)}
+        kinds = np.bincount(self._picture.status, minlength=len(messages.STATUSES)).tolist()
+        counts = {name: kinds[code] for code, name in enumerate(messages.STATUSES)}
         return counts | self._labels.numbers()

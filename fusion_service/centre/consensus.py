@@ -43,41 +43,53 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
 
     All but one: sums of information from the left and from the right of each row, so N rows cost 2 N sums and not N^2.
     """
-    n, count = means.shape
+    count = means.shape[1]
     sized = list(by_size(labels))
-    unique = sized[0][0] if len(sized) == 1 else np.sort(np.concatenate([labels[:0], *(names for names, _ in sized)]))
-    mean, covariance = np.empty((n, len(unique))), np.empty((n, n, len(unique)))
-    partner = np.full(count, -1)
-    size = np.ones(count, dtype=np.intp)
+    partner, size = np.full(count, -1), np.ones(count, dtype=np.intp)
     more: list[tuple[Ints, Floats, Floats]] = []
-    others = np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
-    for names, rows in sized:
-        at = slice(None) if len(sized) == 1 else np.searchsorted(unique, names)
+    compiled = "intersect" in FAST
+    others = (np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)) if compiled else None
+    parts: list[tuple[Floats, Floats]] = [(means[:, :0], covariances[..., :0])]
+    for _, rows in sized:
         k = rows.shape[1]
         size[rows] = k
-        if k == 1:
-            mean[:, at], covariance[:, :, at] = picked(means, rows[:, 0]), picked(covariances, rows[:, 0])
-            continue
-        if "intersect" in FAST:
-            mean[:, at], covariance[:, :, at] = _compiled(rows, means, covariances, *others)
-            continue
         columns = [rows[:, j] for j in range(k)]
-        xs, Ps = [picked(means, one) for one in columns], [picked(covariances, one) for one in columns]
-        if k == 2:
-            mean[:, at], covariance[:, :, at] = uniform_ci(np.stack(xs), np.stack(Ps))
-            partner[columns[0]], partner[columns[1]] = columns[1], columns[0]
+        if k > 1 and others is not None:
+            parts.append(_compiled(rows, means, covariances, *others))
             continue
-        whole, without = _all_but_one(xs, Ps)
-        mean[:, at], covariance[:, :, at] = whole
-        more += [(one, *other) for one, other in zip(columns, without, strict=True)]
-    paired = np.flatnonzero(partner >= 0)
-    if len(paired) == count:
-        others = picked(means, partner), picked(covariances, partner)
-    elif len(paired):
-        others[0][:, paired], others[1][:, :, paired] = means[:, partner[paired]], covariances[:, :, partner[paired]]
+        xs, Ps = [picked(means, one) for one in columns], [picked(covariances, one) for one in columns]
+        if k == 1:
+            parts.append((xs[0], Ps[0]))
+        elif k == 2:
+            parts.append(uniform_ci(np.stack(xs), np.stack(Ps)))
+            partner[columns[0]], partner[columns[1]] = columns[1], columns[0]
+        else:
+            whole, without = _all_but_one(xs, Ps)
+            parts.append(whole)
+            more += [(one, *other) for one, other in zip(columns, without, strict=True)]
+    if others is None:
+        others = _partners(partner, means, covariances)
     for one, x, P in more:
         others[0][:, one], others[1][:, :, one] = x, P
-    return Consensus(unique, mean, covariance, *others, size, [rows for _, rows in sized])
+    groups = [rows for _, rows in sized]
+    if len(sized) == 1:
+        unique, (mean, covariance) = sized[0][0], parts[1]
+    else:
+        unique = np.concatenate([labels[:0], *(names for names, _ in sized)])
+        order = np.argsort(unique)
+        unique = unique[order]
+        mean, covariance = (np.concatenate(part, axis=-1).take(order, axis=-1) for part in zip(*parts, strict=True))
+    return Consensus(unique, mean, covariance, others[0], others[1], size, groups)
+
+
+def _partners(partner: Ints, means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
+    """Means and covariances of the rows `partner` (M,), NaN for -1."""
+    alone = np.flatnonzero(partner < 0)
+    if len(alone) == len(partner):
+        return np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
+    mean, covariance = means.take(partner, axis=-1), covariances.take(partner, axis=-1)
+    mean[:, alone], covariance[:, :, alone] = np.nan, np.nan
+    return mean, covariance
 
 
 def _compiled(

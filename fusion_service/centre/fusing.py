@@ -74,7 +74,11 @@ def fuse_all(
             old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
                 _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound, unknown)
-        mean[:, at], covariance[:, :, at], state_time[at], way[at] = one, spread, time, by
+        state_time[at], way[at] = time, by
+        if len(at) == len(picture.id):
+            mean, covariance = one, spread
+        else:
+            mean[:, at], covariance[:, :, at] = one, spread
         lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory == "recursive")
         influence[members] = gains.T
         done.append(at)

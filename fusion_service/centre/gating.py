@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, among, picked
+from fusion_service.arrays import Bools, Floats, Ints, among, picked, subset
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -53,13 +53,18 @@ def manoeuvred(space: tuple[str, ...], acceleration: float, seconds: Floats) -> 
     """Covariance (n, n, M) of what a constant unknown acceleration (one sigma, m/s2, each axis alike) makes of a
     state in so many seconds (M,)."""
     spread = np.zeros((len(space), len(space), len(seconds)))
+    _add_manoeuvre(spread, space, acceleration, seconds)
+    return spread
+
+
+def _add_manoeuvre(spread: Floats, space: tuple[str, ...], acceleration: float, seconds: Floats) -> None:
+    """Add what `manoeuvred` gives to covariances (n, n, M)."""
     gains = (0.5 * seconds**2, seconds, np.ones_like(seconds))
     for axis in AXES:
         there = [(space.index(name), gain) for name, gain in zip(axis, gains, strict=True) if name in space]
         for i, one in there:
             for j, other in there:
-                spread[i, j] = acceleration**2 * one * other
-    return spread
+                spread[i, j] += acceleration**2 * one * other
 
 
 def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings, journal: Journal) -> Judgement:
@@ -72,7 +77,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     jumped = fresh & (predicted > tests.keep[seen])
     outside = np.where(fresh, jumped, tracks.outside[linked])
     some = np.flatnonzero(~outside if rows.out is None else ~outside & ~rows.out[linked])
-    agreed = consensus(links[some], picked(tracks.mean, linked[some]), picked(tracks.covariance, linked[some]))
+    agreed = consensus(links[some], subset(tracks.mean, linked[some]), subset(tracks.covariance, linked[some]))
     distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
     failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep[shared])
@@ -98,14 +103,18 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
 def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensus:
     """What the rows `inside` say together, from what all of `had` said: only tracks that lost one are fused anew."""
     tracks = rows.tracks
-    kept = among(had, inside)
+    mark = np.zeros(len(rows.source), dtype=np.bool_)
+    mark[inside] = True
+    kept = np.flatnonzero(mark[had])
     links = tracks.link[inside]
-    labels, group = np.unique(links, return_inverse=True)
-    at = np.searchsorted(agreed.labels, labels)
+    place = np.searchsorted(agreed.labels, links)
+    count = np.bincount(place, minlength=len(agreed.labels))
+    at = np.flatnonzero(count)
+    labels = agreed.labels[at]
     mean, covariance = picked(agreed.mean, at), picked(agreed.covariance, at)
     others_mean, others_covariance = picked(agreed.others_mean, kept), picked(agreed.others_covariance, kept)
     size = agreed.size[kept]
-    fewer = np.flatnonzero(size != np.bincount(group, minlength=len(labels))[group])
+    fewer = np.flatnonzero(size != count[place])
     some = inside[fewer]
     anew = consensus(links[fewer], picked(tracks.mean, some), picked(tracks.covariance, some))
     changed = np.searchsorted(labels, anew.labels)
@@ -121,21 +130,27 @@ def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings
     tracks = rows.tracks
     at = now.find(tracks.link[linked])
     seconds = np.maximum(time - now.seen[at], 0) / 1e9
-    spread = picked(tracks.covariance, linked) + picked(now.covariance, at)
-    spread += manoeuvred(settings.space, settings.manoeuvre, seconds)
+    spread = subset(tracks.covariance, linked) + picked(now.covariance, at)
+    _add_manoeuvre(spread, settings.space, settings.manoeuvre, seconds)
     size, _ = settings.tests.unknown.common(spread)
-    distance = linalg.quadratic(spread, picked(tracks.mean, linked) - picked(now.mean, at))
+    distance = linalg.quadratic(spread, subset(tracks.mean, linked) - picked(now.mean, at))
     return np.where(now.time[at] >= 0, np.where(np.isnan(distance), np.inf, distance), 0.0), size
 
 
 def _from_others(rows: Rows, some: Ints, agreed: Consensus, tests: Tests) -> tuple[Floats, Ints]:
     """d2 (S,) of each row to the others of its track, NaN where it is alone, and over how many components."""
     distance, size = np.full(len(some), np.nan), np.zeros(len(some), dtype=np.intp)
-    several = np.flatnonzero(agreed.size > 1)
-    at = some[several]
-    spread = picked(rows.tracks.covariance, at) + picked(agreed.others_covariance, several)
-    distance[several] = linalg.quadratic(spread, picked(rows.tracks.mean, at) - picked(agreed.others_mean, several))
-    size[several], _ = tests.unknown.common(spread)
+    mean, covariance = rows.tracks.mean, rows.tracks.covariance
+    for members in agreed.groups:
+        if members.shape[1] < 2:
+            continue
+        of_two = members.shape[1] == 2  # as far from each other both ways, to the bit
+        at = members[:, 0] if of_two else members.reshape(-1)
+        spread = picked(covariance, some[at]) + picked(agreed.others_covariance, at)
+        apart = linalg.quadratic(spread, picked(mean, some[at]) - picked(agreed.others_mean, at))
+        common, _ = tests.unknown.common(spread)
+        distance[members] = apart[:, None] if of_two else apart.reshape(members.shape)
+        size[members] = common[:, None] if of_two else common.reshape(members.shape)
     return distance, size
 
 

@@ -116,7 +116,7 @@ class Identities:
         return self._intake.said.identity.schemes()
 
     def _classes(self) -> int:
-        return int(np.clip(len(self._intake.said.kind.texts), 2, MOST_CLASSES))
+        return min(max(len(self._intake.said.kind.texts), 2), MOST_CLASSES)
 
     def _stated(self, setting: str, source: Ints) -> Floats:
         """A setting of each of the sources (indices into the sorted names)."""

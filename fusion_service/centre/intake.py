@@ -355,7 +355,7 @@ class Intake:
             batch = [item for _, item in run]
             source, first, _ = batch[0][0]
             for (_, _, entry), faults in batch:
-                for code in np.unique(faults[faults > 0]).tolist():
+                for code in np.unique(faults[faults > 0]).tolist() if faults.any() else ():
                     journal.refuse(replace(entry, reason=FAULTS[code], count=int((faults == code).sum())))
             sound = [faults == 0 for _, faults in batch]
             messages = [message for (_, message, _), _ in batch]

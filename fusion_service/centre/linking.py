@@ -93,12 +93,11 @@ class Linker:
         """Exchange links and let loose rows join, source by source; a track that takes part in an exchange of
         one source is left alone by the others until the next step. Returns the rows that joined a track."""
         sums = self._rival_sums(rows, now, near)
-        weight = self.tests.weight(rows.tracks.data)
         touched = np.zeros(len(now.id), dtype=np.bool_)
         joined: list[Ints] = [np.zeros(0, dtype=np.intp)]
-        active = near.joins.first, near.rivals.first[sums > weight[near.rivals.first]]
+        active = near.joins.first, near.rivals.first[sums > self.tests.weight(rows.tracks.data[near.rivals.first])]
         for name in np.unique(rows.source[np.concatenate(active)]).tolist():
-            row, track, value, stays = self._options(rows, now, near, sums, weight, name, touched)
+            row, track, value, stays = self._options(rows, now, near, sums, name, touched)
             if not len(row):
                 continue
             order = np.lexsort((track, row))
@@ -129,7 +128,7 @@ class Linker:
         return np.clip(MEMORY * before + more, -LOW, MOST_RIVAL)
 
     def _options(
-        self, rows: Rows, now: Picture, near: Candidates, sums: Floats, weight: Floats, name: int, touched: Bools
+        self, rows: Rows, now: Picture, near: Candidates, sums: Floats, name: int, touched: Bools
     ) -> tuple[Ints, Ints, Floats, Bools]:
         """Of one source: the possible pairs (row, track), what each is worth, and which of them are as they stand.
         Only clusters in which something can change."""
@@ -145,7 +144,7 @@ class Linker:
         holders = _holders(rows, now, np.concatenate([joins.second, rivals.second]), name)
         standing = np.unique(np.concatenate([believed, loose[tracks.link[loose] != NO_TRACK], holders]))
         at = now.find(tracks.link[standing])
-        stay = np.where(tracks.outside[standing], 0.5, STANDING + weight[standing])
+        stay = np.where(tracks.outside[standing], 0.5, STANDING + self.tests.weight(tracks.data[standing]))
         row = np.concatenate([joins.first, rivals.first, standing])
         track = np.concatenate([joins.second, rivals.second, at])
         value = np.concatenate([worth, STANDING + sums, stay])
@@ -156,7 +155,7 @@ class Linker:
         own = tracks.link[row] == now.id[track]
         free &= stays | ~own
         row, track, value, stays = row[free], track[free], value[free], stays[free]
-        reason = np.concatenate([loose, rivals.first[sums > weight[rivals.first]]])
+        reason = np.concatenate([loose, rivals.first[sums > self.tests.weight(tracks.data[rivals.first])]])
         inside = _in_clusters(row, track, reason, len(rows.source), len(now.id))
         return row[inside], track[inside], value[inside], stays[inside]
 
