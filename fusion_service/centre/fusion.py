@@ -142,7 +142,8 @@ class FusionCentre(Centre):
             gone = among(self._picture.id, np.array(list(merged), dtype=np.uint64))
             self._picture, now = self._picture.take(~gone), now.take(~gone[:count])
             count = len(now.id)
-        now = now.join(self._picture.take(slice(count, None)))
+        if len(self._picture.id) > count:
+            now = now.join(self._picture.take(slice(count, None)))
         if (order := now.order()) is not None:  # a step made again gives ids that are known
             self._picture, now = self._picture.take(order), now.take(order)
         return now

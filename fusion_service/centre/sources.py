@@ -15,6 +15,7 @@ from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
 from fusion_service.centre.places import Place, followed
 from fusion_service.centre.tracks import Pair, Tracks, by_id, empty_tracks, join_tracks, renewed
+from fusion_service.config import SourceConfig
 from fusion_service.records import altered
 from schemas import LocalTracks, SensorInfo
 
@@ -35,6 +36,7 @@ class Source:
     that say one. Of the step being made: came, the time of each message with tracks, and when it came, ns; arrived, the
     ids that came; dropped, the links of tracks that complete scans list no more; pairs, the versions of what came,
     where those are followed; ahead, the time of the newest message that is for a later one.
+    declared: its info, and what holds for it by that and the config.
     """
 
     name: str
@@ -70,6 +72,7 @@ class Source:
     first: dict[str, int] = field(default_factory=dict)
     seen: deque[tuple[str, int, int]] = field(default_factory=deque)
     seen_set: set[tuple[str, int, int]] = field(default_factory=set)
+    declared: tuple[SensorInfo | None, SourceConfig] | None = None
 
     def begin(self, epoch: int) -> None:
         """Forget the last run: tracks, links, sequence."""
