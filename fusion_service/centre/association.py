@@ -59,14 +59,15 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
         return
     order = np.argsort(labels, kind="stable")
     ranked = labels[order]
-    starts = np.append(0, np.flatnonzero(ranked[1:] != ranked[:-1]) + 1)
-    counts = np.diff(starts, append=len(labels))
-    unique = ranked[starts]
-    sizes = np.flatnonzero(np.bincount(counts)).tolist()
-    if len(sizes) == 1:
-        yield unique, order.reshape(len(unique), sizes[0])
+    new = np.flatnonzero(ranked[1:] != ranked[:-1])
+    edges = np.zeros(len(new) + 2, dtype=np.intp)
+    edges[1:-1], edges[-1] = new + 1, len(labels)
+    starts, counts = edges[:-1], edges[1:] - edges[:-1]
+    unique, size = ranked[starts], int(counts[0])
+    if (counts == size).all():
+        yield unique, order.reshape(len(unique), size)
         return
-    for k in sizes:
+    for k in np.flatnonzero(np.bincount(counts)).tolist():
         chosen = counts == k
         yield unique[chosen], order[starts[chosen][:, None] + np.arange(k)]
 

@@ -173,9 +173,9 @@ class FusionCentre(Centre):
         interval = rows.interval[inside]
         slack = np.maximum(interval // 2, round(self.config.period * 1e9))
         expected = rows.tracks.seen[inside] + interval + np.where(rows.lost[inside], 0, slack)
-        expected = np.where(
-            self._intake.spared.of(self._intake.names())[rows.source[inside]], np.maximum(expected, time), expected
-        )
+        spared = self._intake.spared.of(self._intake.names())
+        if spared.any():
+            expected = np.where(spared[rows.source[inside]], np.maximum(expected, time), expected)
         due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
         np.maximum.at(due, at, expected)
         np.maximum.at(slowest, at, interval)
@@ -186,7 +186,7 @@ class FusionCentre(Centre):
         whole = np.full(len(rows.source), -1, dtype=np.int64)
         whole[inside] = expected
         left = shared.support(due, whole, linked == 0)
-        unlisted = [links for source in self._intake.sources.values() for links in source.dropped]
+        unlisted = [links for source in self._intake.sources.values() for links in source.dropped if len(links)]
         dropped = left & among(self._picture.id, np.concatenate([NOTHING, *unlisted]))
         return Support(sources, hit, due, slowest, left, dropped, self._last)
 

@@ -35,8 +35,8 @@ class Source:
     lag: how far behind the last step its messages come, ns, about the longest of late. places: of its newest messages
     that say one. Of the step being made: came, the time of each message with tracks, and when it came, ns; arrived, the
     ids that came; dropped, the links of tracks that complete scans list no more; pairs, the versions of what came,
-    where those are followed; ahead, the time of the newest message that is for a later one.
-    declared: its info, and what holds for it by that and the config.
+    where those are followed; ahead, the time of the newest message that is for a later one. declared: its info, and
+    what holds for it by that and the config.
     """
 
     name: str
