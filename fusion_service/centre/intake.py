@@ -352,6 +352,7 @@ class Intake:
             for (source, message, entry), faults in zip(items, codes, strict=True)
         ]
         self._settle_frame(checked, time, journal)
+        checked = [((source, _framed(one, self.frame), entry), faults) for (source, one, entry), faults in checked]
         for _, run in groupby(enumerate(checked), key=_run_key):
             batch = [item for _, item in run]
             source, first, _ = batch[0][0]
@@ -382,6 +383,13 @@ class Intake:
             if reason:
                 for (_, message, entry), _ in batch:
                     journal.refuse(replace(entry, reason=reason, count=len(message.ids)))
+
+
+def _framed(message: LocalTracks, frame: Frame | None) -> LocalTracks:
+    """A scan; an empty picture of another centre is in the frame that this one has by now: it may have had none."""
+    if frame is None or len(message.ids) or message.frame == frame or not is_picture_of(message.source):
+        return message
+    return replace(message, frame=frame)
 
 
 def _run_key(item: tuple[int, tuple[tuple[Source, LocalTracks, Entry], object]]) -> tuple[object, ...]:

@@ -60,8 +60,7 @@ class Unknown:
         known = np.ones(covariance.shape[1:], dtype=np.bool_)
         for k, limit in enumerate(self.limit.tolist()):
             if limit < np.inf:
-                np.greater_equal(covariance[k, k], limit, out=known[k])
-                np.logical_not(known[k], out=known[k])
+                known[k] = ~(covariance[k, k] >= limit)
         return known
 
     def told(self, covariance: Floats) -> Floats:

@@ -384,6 +384,8 @@ def from_logs(mission: Mission) -> list[StepResult]:
     for result in mission.results:
         log = schemas.decode(schemas.encode(result.log))
         assert isinstance(log, schemas.StepLog)
+        for one in log.dropped:
+            centre.handle(Refused(one.source, one.reason, one.count, dropped=True), 2**62)
         for event in log.events:
             kind = event["kind"]
             if kind == "era":
