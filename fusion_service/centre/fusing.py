@@ -57,11 +57,11 @@ def fuse_all(
     linked = linked if left is None else linked & ~left
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
     chosen = np.flatnonzero(used)
-    mean, covariance, lineage = picture.mean.copy(), picture.covariance.copy(), picture.lineage.copy()
-    way = picture.way.copy()
+    lineage, way = picture.lineage.copy(), picture.way.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
-    done: list[Ints] = []
+    done: list[Ints] = [np.zeros(0, dtype=np.intp)]
+    states: list[tuple[Floats, Floats]] = []
     unknown = Unknown.of(config.space)
     for ids, groups in by_size(tracks.link[chosen]):
         at, members = picture.find(ids), chosen[groups]
@@ -75,16 +75,30 @@ def fuse_all(
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
                 _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound, unknown)
         state_time[at], way[at] = time, by
-        if len(at) == len(picture.id):
-            mean, covariance = one, spread
-        else:
-            mean[:, at], covariance[:, :, at] = one, spread
+        states.append((one, spread))
         lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory == "recursive")
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
+    at = np.concatenate(done)
+    mean, covariance = _placed(picture, at, states)
     picture = altered(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
-    return with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
+    return with_parts(picture, at, mixed), influence
+
+
+def _placed(picture: Picture, at: Ints, states: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Means and covariances of the picture, those of the tracks `at` (K,) being `states`, one after the other."""
+    if len(states) == 1 and len(at) == len(picture.id):
+        return states[0]
+    if not states:
+        return picture.mean, picture.covariance
+    ones, spreads = (np.concatenate(part, axis=-1) for part in zip(*states, strict=True))
+    if len(at) == len(picture.id):
+        order = np.argsort(at)
+        return ones.take(order, axis=-1), spreads.take(order, axis=-1)
+    mean, covariance = picture.mean.copy(), picture.covariance.copy()
+    mean[:, at], covariance[:, :, at] = ones, spreads
+    return mean, covariance
 
 
 def _gaussian(

@@ -92,6 +92,8 @@ class Linker:
     def _assign(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> Ints:
         """Exchange links and let loose rows join, source by source; a track that takes part in an exchange of
         one source is left alone by the others until the next step. Returns the rows that joined a track."""
+        if not (len(near.joins.first) or len(near.rivals.first) or self.rivals.by_source):
+            return np.zeros(0, dtype=np.intp)
         sums = self._rival_sums(rows, now, near)
         touched = np.zeros(len(now.id), dtype=np.bool_)
         joined: list[Ints] = [np.zeros(0, dtype=np.intp)]
