@@ -8,13 +8,15 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Ints", "find_sorted", "from_bytes", "picked", "to_bytes"]
+__all__ = ["Bools", "Floats", "Ints", "among", "find_sorted", "from_bytes", "picked", "subset", "to_bytes"]
 
 Number = TypeVar("Number", bound=np.generic)
 Floats = NDArray[np.float64]
 Ints = NDArray[np.intp]
 Bools = NDArray[np.bool_]
 
+SHORT = 4
+"""Values that are compared one by one."""
 FEW = 64
 """Below, a search is quicker than a table."""
 SPARSE = 8
@@ -33,12 +35,30 @@ def find_sorted(ids: NDArray[np.uint64], some: NDArray[np.uint64]) -> Ints:
     return before.cumsum()[(np.clip(some, np.uint64(first), np.uint64(last + 1)) - np.uint64(first)).astype(np.intp)]
 
 
+def among(values: NDArray[np.integer[Any]], some: NDArray[np.integer[Any]]) -> Bools:
+    """`np.isin(values, some)` (K,) of two flat arrays of one kind: where one of them is empty, or the second short, as
+    they are nearly always, at a fraction of its price."""
+    if not len(some) or not len(values):
+        return np.zeros(len(values), dtype=np.bool_)
+    if len(some) > SHORT:
+        return np.isin(values, some)
+    found: Bools = values == some[0]
+    for one in some[1:]:
+        found |= values == one
+    return found
+
+
 def picked(array: NDArray[Number], rows: Any) -> NDArray[Number]:
     """`array[..., rows]` with the batch contiguous: NumPy's own leaves it first in memory, and every element of what is
     done with it then is a line of the cache away from the next."""
     if not isinstance(rows, np.ndarray):
         return array[..., rows]
     return array.take(np.flatnonzero(rows) if rows.dtype == np.bool_ else rows, axis=-1)
+
+
+def subset(array: NDArray[Number], rows: Ints) -> NDArray[Number]:
+    """`picked` of rows that are in order, each once: the array itself, no copy, where these are all of them."""
+    return array if len(rows) == array.shape[-1] else array.take(rows, axis=-1)
 
 
 def to_bytes(array: NDArray[Any]) -> bytes:

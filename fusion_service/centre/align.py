@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
@@ -27,6 +27,7 @@ from fusion_service.centre.tracks import LINKS, Columns, Tracks, join_tracks, no
 from fusion_service.centre.treatment import Treatment, treated
 from fusion_service.config import SourceConfig
 from fusion_service.densities import Mixtures
+from fusion_service.records import altered
 from schemas import Entry, Frame, Motion
 
 __all__ = ["predict_tracks", "usable_rows", "write_back"]
@@ -145,7 +146,7 @@ def _shifted(tracks: Tracks, shift: Floats | None) -> Tracks:
         return tracks
     more = shift[:, :, None]
     parts = tracks.part_covariance + more[..., None]
-    return replace(tracks, covariance=tracks.covariance + more, part_covariance=parts)
+    return altered(tracks, covariance=tracks.covariance + more, part_covariance=parts)
 
 
 def predict_tracks(
@@ -168,10 +169,10 @@ def predict_tracks(
         one, spread = tracks.mean[:, None], tracks.covariance[:, :, None]
         one, spread = predict_known(motion, space, one, spread, known, *how)
         parts = no_parts(len(wanted), len(dt))
-        return replace(tracks, mean=one[:, 0], covariance=spread[:, :, 0], **dict(zip(PARTS, parts, strict=True)))
+        return altered(tracks, mean=one[:, 0], covariance=spread[:, :, 0], **dict(zip(PARTS, parts, strict=True)))
     means, covariances = predict_known(motion, space, tracks.part_mean, tracks.part_covariance, known, *how)
     mean, covariance = Mixtures(tracks.log_weight, means, covariances).moments()
-    return replace(tracks, mean=mean, covariance=covariance, part_mean=means, part_covariance=covariances)
+    return altered(tracks, mean=mean, covariance=covariance, part_mean=means, part_covariance=covariances)
 
 
 def write_back(rows: Rows, intake: Intake) -> None:
@@ -179,5 +180,5 @@ def write_back(rows: Rows, intake: Intake) -> None:
     start = 0
     for name, count in rows.kept.items():
         source, part = intake.sources[name], slice(start, start + count)
-        source.tracks = replace(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINKS})
+        source.tracks = altered(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINKS})
         start += count

@@ -55,9 +55,19 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
 
     Groups come in order of label within a size, rows in their own order within a group.
     """
+    if not len(labels):
+        return
     order = np.argsort(labels, kind="stable")
-    unique, starts, counts = np.unique(labels[order], return_index=True, return_counts=True)
-    for k in np.unique(counts):
+    ranked = labels[order]
+    new = np.flatnonzero(ranked[1:] != ranked[:-1])
+    edges = np.zeros(len(new) + 2, dtype=np.intp)
+    edges[1:-1], edges[-1] = new + 1, len(labels)
+    starts, counts = edges[:-1], edges[1:] - edges[:-1]
+    unique, size = ranked[starts], int(counts[0])
+    if (counts == size).all():
+        yield unique, order.reshape(len(unique), size)
+        return
+    for k in np.flatnonzero(np.bincount(counts)).tolist():
         chosen = counts == k
         yield unique[chosen], order[starts[chosen][:, None] + np.arange(k)]
 

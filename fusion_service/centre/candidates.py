@@ -8,13 +8,14 @@ with a track as that track is without the row's own source, so that no source vo
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints, picked
+from fusion_service.arrays import Floats, Ints, among, picked
 from fusion_service.centre.association import overlap
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import Judgement
@@ -25,6 +26,7 @@ from fusion_service.centre.neighbours import Neighbours
 from fusion_service.centre.partial import Unknown, apart
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.densities import Mixtures
+from fusion_service.records import altered, columns_of
 
 __all__ = ["Candidates", "Pairs", "find_candidates"]
 
@@ -45,8 +47,14 @@ class Pairs:
     gate: Floats
 
     def take(self, some: NDArray[np.bool_] | Ints) -> Pairs:
-        """Those given."""
-        return Pairs(*(getattr(self, one.name)[some] for one in fields(self)))
+        """Those given; the same where a mask holds for all."""
+        if some.dtype == np.bool_ and some.all():
+            return self
+        return Pairs(*(column[some] for column in columns_of(self)))
+
+
+_NOBODY, _NOTHING = np.zeros(0, dtype=np.intp), np.zeros(0)
+NO_PAIRS = Pairs(_NOBODY, _NOBODY, _NOTHING, _NOTHING, _NOBODY, _NOTHING)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -70,13 +78,16 @@ def find_candidates(
 ) -> Candidates:
     """All that may meet. now: the picture predicted to the step; beside: who was near in the last one."""
     tracks, agreed = rows.tracks, judged.agreed
-    mean, covariance = now.mean.copy(), now.covariance.copy()
-    at = now.find(agreed.labels)
-    mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
+    mean, covariance = agreed.mean, agreed.covariance
+    if len(agreed.labels) < len(now.id):
+        mean, covariance, at = now.mean.copy(), now.covariance.copy(), now.find(agreed.labels)
+        mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
     loose = np.flatnonzero(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
     known = np.flatnonzero(now.time >= 0)
-    means = np.concatenate([picked(mean, known), picked(tracks.mean, loose)], axis=1)
-    covariances = np.concatenate([picked(covariance, known), picked(tracks.covariance, loose)], axis=2)
+    means, covariances = (mean, covariance) if len(known) == len(now.id) else (mean[:, known], covariance[..., known])
+    if len(loose):
+        means = np.concatenate([means, picked(tracks.mean, loose)], axis=1)
+        covariances = np.concatenate([covariances, picked(tracks.covariance, loose)], axis=2)
     source = np.concatenate([np.full(len(known), -1), rows.source[loose]])
     compartment = np.concatenate([meeting.compartment_of_tracks[known], meeting.compartment_of_rows[loose]])
     gates = np.concatenate([np.tile(tests.gate[:, None], len(known)), rows.gate[:, loose]], axis=1)
@@ -100,21 +111,25 @@ def find_candidates(
     row, track = _near_own(rows, now, judged.inside, pairs_gg, known)
     rivals = lookup.pairs(row, track, None)
     own = np.full(len(tracks.id), np.nan)
-    mine = np.unique(rivals.first)
-    own[mine] = lookup.cost(mine, now.find(tracks.link[mine]))
-    gg = replace(pairs_gg, first=known[pairs_gg.first], second=known[pairs_gg.second])
-    rr = replace(pairs_rr, first=node[pairs_rr.first], second=node[pairs_rr.second])
+    if len(rivals.first):
+        mine = np.unique(rivals.first)
+        own[mine] = lookup.cost(mine, now.find(tracks.link[mine]))
+    gg = altered(pairs_gg, first=known[pairs_gg.first], second=known[pairs_gg.second])
+    rr = altered(pairs_rr, first=node[pairs_rr.first], second=node[pairs_rr.second])
     return _said(Candidates(gg, joins, rivals, rr, own, loose, mean, covariance), rows, now, meeting)
 
 
 def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candidates:
     """Those of them that orders and identities allow, and what these say of one target against two counted as the
     states are: minus twice the log-likelihood ratio in what a pair costs."""
-    own = near.own.copy()
+    own, joins, rivals = near.own, near.joins, near.rivals
     mine = np.flatnonzero(np.isfinite(own))
-    own[mine] -= 2.0 * meeting.with_tracks(mine, now.find(rows.tracks.link[mine])).ratio
-    joins, rivals = (pairs.take(~np.isin(pairs.first, meeting.forced_row)) for pairs in (near.joins, near.rivals))
-    return replace(
+    if len(mine):
+        own = own.copy()
+        own[mine] -= 2.0 * meeting.with_tracks(mine, now.find(rows.tracks.link[mine])).ratio
+    if len(meeting.forced_row):
+        joins, rivals = (pairs.take(~among(pairs.first, meeting.forced_row)) for pairs in (joins, rivals))
+    return altered(
         near,
         tracks=near.tracks.take(~meeting.of_tracks(near.tracks.first, near.tracks.second)),
         joins=_allowed(joins, meeting.with_tracks),
@@ -125,8 +140,10 @@ def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candi
 
 
 def _allowed(pairs: Pairs, say: Callable[[Ints, Ints], Terms]) -> Pairs:
+    if not len(pairs.first):
+        return pairs
     terms = say(pairs.first, pairs.second)
-    return replace(pairs, spread=pairs.spread - 2.0 * terms.ratio).take(~terms.forbidden)
+    return altered(pairs, spread=pairs.spread - 2.0 * terms.ratio).take(~terms.forbidden)
 
 
 class _Without:
@@ -138,19 +155,24 @@ class _Without:
         self._rows, self._now, self._judged, self._unknown = rows, now, judged, unknown
         self._mean, self._covariance = mean, covariance
         self._width = max(len(now.id), 1)
-        inside = judged.inside
-        keys = rows.source[inside] * self._width + now.find(rows.tracks.link[inside])
-        self._order = np.argsort(keys, kind="stable")
-        self._keys = keys[self._order]
+
+    @cached_property
+    def _sorted(self) -> tuple[Ints, Ints]:
+        """Keys of (source, track) of the believed rows, in order, and which rows these are."""
+        inside = self._judged.inside
+        keys = self._rows.source[inside] * self._width + self._now.find(self._rows.tracks.link[inside])
+        order = np.argsort(keys, kind="stable")
+        return keys[order], order
 
     def state(self, row: Ints, track: Ints) -> tuple[Floats, Floats]:
         """Mean (n, K) and covariance (n, n, K) of the tracks without the sources of the rows."""
         mean, covariance = picked(self._mean, track), picked(self._covariance, track)
-        if len(self._keys):
+        keys, order = self._sorted
+        if len(keys):
             key = self._rows.source[row] * self._width + track
-            at = np.minimum(np.searchsorted(self._keys, key), len(self._keys) - 1)
-            mine = np.flatnonzero(self._keys[at] == key)
-            place = self._order[at[mine]]
+            at = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
+            mine = np.flatnonzero(keys[at] == key)
+            place = order[at[mine]]
             agreed = self._judged.agreed
             others = agreed.size[place] > 1
             some, alone = mine[others], mine[~others]
@@ -176,6 +198,8 @@ class _Without:
 
     def pairs(self, row: Ints, track: Ints, mixtures: tuple[Mixtures, Mixtures] | None) -> Pairs:
         """Those of the pairs within the gate of the row, in order; of mixtures the d2 of their nearest components."""
+        if not len(row):
+            return NO_PAIRS
         order = np.lexsort((track, row))
         row, track = row[order], track[order]
         distance, spread, size = self._distances(row, track)
@@ -198,6 +222,8 @@ def _overlap(first: Mixtures, second: Mixtures, unknown: Unknown) -> tuple[Float
 def _gated(
     means: Floats, covariances: Floats, i: Ints, j: Ints, gates: Floats, parts: Mixtures | None, unknown: Unknown
 ) -> Pairs:
+    if not len(i):
+        return NO_PAIRS
     distance, spread, size = np.empty(len(i)), np.empty(len(i)), np.empty(len(i), dtype=np.intp)
     for part in linalg.blocks(len(means), len(i)):
         a, b = i[part], j[part]

@@ -10,7 +10,6 @@ depend on the size of its batch: the same events give the same bytes.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import dataclass, replace
@@ -22,7 +21,7 @@ from numpy.typing import NDArray
 from fusion_service import __version__
 from fusion_service.centre.align import usable_rows
 from fusion_service.centre.checkpoint import CheckpointError, pack_state, unpack_state
-from fusion_service.centre.deltas import Deltas, fed
+from fusion_service.centre.deltas import Deltas
 from fusion_service.centre.era import GLOBAL_TIMES, ClockSet, EraWatch, NewEra, rebased
 from fusion_service.centre.events import Event, Refused, Skipped
 from fusion_service.centre.history import History, Past
@@ -152,7 +151,7 @@ class Centre(ABC):
             rule=self._rule,
             revised=revised,
         )
-        tracks = self._deltas.of(picture, fed(self._intake.sources.values()))
+        tracks = self._deltas.of(picture, self._intake.sources.values())
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
         notes = self._era.notes(time)
@@ -346,6 +345,6 @@ class Centre(ABC):
             source.tracks = replace(source.tracks, lineage=new[source.tracks.lineage])
 
     def _numbers(self) -> dict[str, int]:
-        kinds = Counter(self._picture.status.tolist())
-        counts = {name: kinds.get(code, 0) for code, name in enumerate(messages.STATUSES)}
+        kinds = np.bincount(self._picture.status, minlength=len(messages.STATUSES)).tolist()
+        counts = {name: kinds[code] for code, name in enumerate(messages.STATUSES)}
         return counts | self._labels.numbers()

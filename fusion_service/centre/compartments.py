@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import find_sorted
+from fusion_service.arrays import among, find_sorted
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import Source
@@ -55,7 +55,7 @@ class Compartments:
         """After a step: ids (G,) sorted, of its picture; rows with the links of the step."""
         origin, apart = self._now(ids, rows, names)
         still = self._quarantined()
-        self.track, self.origin, self.apart = ids, origin, np.where(np.isin(apart, still), apart, NONE).astype(np.int32)
+        self.track, self.origin, self.apart = ids, origin, np.where(among(apart, still), apart, NONE).astype(np.int32)
         if not len(still) and len(self._names.texts) > len(ORIGINS):
             self._names = Words()
 

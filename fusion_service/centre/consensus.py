@@ -26,7 +26,8 @@ SOUND = 1e-8
 @dataclass(frozen=True, slots=True, eq=False)
 class Consensus:
     """Of M rows in G groups: mean (n, G) and covariance (n, n, G) of all rows of each group; others_mean (n, M) and
-    others_covariance (n, n, M) of the group without the row (NaN where it is alone); size (M,) of its group."""
+    others_covariance (n, n, M) of the group without the row (NaN where it is alone); size (M,) of its group; groups:
+    rows (g, k) of the groups of each size k (left empty where some were made anew)."""
 
     labels: NDArray[np.uint64]
     mean: Floats
@@ -34,6 +35,7 @@ class Consensus:
     others_mean: Floats
     others_covariance: Floats
     size: Ints
+    groups: list[Ints]
 
 
 def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) -> Consensus:
@@ -41,40 +43,53 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
 
     All but one: sums of information from the left and from the right of each row, so N rows cost 2 N sums and not N^2.
     """
-    n, count = means.shape
-    unique = np.unique(labels)
-    mean, covariance = np.empty((n, len(unique))), np.empty((n, n, len(unique)))
-    partner = np.full(count, -1)
-    size = np.ones(count, dtype=np.intp)
+    count = means.shape[1]
+    sized = list(by_size(labels))
+    partner, size = np.full(count, -1), np.ones(count, dtype=np.intp)
     more: list[tuple[Ints, Floats, Floats]] = []
-    others = np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
-    for names, rows in by_size(labels):
-        at = np.searchsorted(unique, names)
+    compiled = "intersect" in FAST
+    others = (np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)) if compiled else None
+    parts: list[tuple[Floats, Floats]] = [(means[:, :0], covariances[..., :0])]
+    for _, rows in sized:
         k = rows.shape[1]
         size[rows] = k
-        if k == 1:
-            mean[:, at], covariance[:, :, at] = picked(means, rows[:, 0]), picked(covariances, rows[:, 0])
-            continue
-        if "intersect" in FAST:
-            mean[:, at], covariance[:, :, at] = _compiled(rows, means, covariances, *others)
-            continue
         columns = [rows[:, j] for j in range(k)]
-        xs, Ps = [picked(means, one) for one in columns], [picked(covariances, one) for one in columns]
-        if k == 2:
-            mean[:, at], covariance[:, :, at] = uniform_ci(np.stack(xs), np.stack(Ps))
-            partner[columns[0]], partner[columns[1]] = columns[1], columns[0]
+        if k > 1 and others is not None:
+            parts.append(_compiled(rows, means, covariances, *others))
             continue
-        whole, without = _all_but_one(xs, Ps)
-        mean[:, at], covariance[:, :, at] = whole
-        more += [(one, *other) for one, other in zip(columns, without, strict=True)]
-    paired = np.flatnonzero(partner >= 0)
-    if len(paired) == count:
-        others = picked(means, partner), picked(covariances, partner)
-    elif len(paired):
-        others[0][:, paired], others[1][:, :, paired] = means[:, partner[paired]], covariances[:, :, partner[paired]]
+        xs, Ps = [picked(means, one) for one in columns], [picked(covariances, one) for one in columns]
+        if k == 1:
+            parts.append((xs[0], Ps[0]))
+        elif k == 2:
+            parts.append(uniform_ci(np.stack(xs), np.stack(Ps)))
+            partner[columns[0]], partner[columns[1]] = columns[1], columns[0]
+        else:
+            whole, without = _all_but_one(xs, Ps)
+            parts.append(whole)
+            more += [(one, *other) for one, other in zip(columns, without, strict=True)]
+    if others is None:
+        others = _partners(partner, means, covariances)
     for one, x, P in more:
         others[0][:, one], others[1][:, :, one] = x, P
-    return Consensus(unique, mean, covariance, *others, size)
+    groups = [rows for _, rows in sized]
+    if len(sized) == 1:
+        unique, (mean, covariance) = sized[0][0], parts[1]
+    else:
+        unique = np.concatenate([labels[:0], *(names for names, _ in sized)])
+        order = np.argsort(unique)
+        unique = unique[order]
+        mean, covariance = (np.concatenate(part, axis=-1).take(order, axis=-1) for part in zip(*parts, strict=True))
+    return Consensus(unique, mean, covariance, others[0], others[1], size, groups)
+
+
+def _partners(partner: Ints, means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
+    """Means and covariances of the rows `partner` (M,), NaN for -1."""
+    alone = np.flatnonzero(partner < 0)
+    if len(alone) == len(partner):
+        return np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
+    mean, covariance = means.take(partner, axis=-1), covariances.take(partner, axis=-1)
+    mean[:, alone], covariance[:, :, alone] = np.nan, np.nan
+    return mean, covariance
 
 
 def _compiled(
@@ -105,40 +120,49 @@ def _of_groups(rows: Ints, means: Floats, covariances: Floats) -> tuple[Floats, 
 
 def _all_but_one(xs: list[Floats], Ps: list[Floats]) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:
     """Fusion of all k rows of B groups, and of all but each."""
-    k = len(xs)
-    swept = [linalg.sweep(P) for P in Ps]
-    least = swept[0][2]
-    for _, _, margin in swept[1:]:
-        least = np.minimum(least, margin)
-    information = [one[0] for one in swept]
-    vectors = [linalg.matvec(Y, x) for Y, x in zip(information, xs, strict=True)]
+    k, count = len(xs), xs[0].shape[1]
+    inverse, _, margins = linalg.sweep(np.concatenate(Ps, axis=2))
+    vector = linalg.matvec(inverse, np.concatenate(xs, axis=1))
+    each = [slice(j * count, (j + 1) * count) for j in range(k)]
+    least = margins[each[0]]
+    for part in each[1:]:
+        least = np.minimum(least, margins[part])
+    information, vectors = [inverse[..., part] for part in each], [vector[:, part] for part in each]
     right: list[tuple[Floats, Floats] | None] = [None] * k
     for j in range(k - 1, 0, -1):
         after = right[j] if j < k - 1 else None
         now = (information[j], vectors[j])
         right[j - 1] = now if after is None else (after[0] + now[0], after[1] + now[1])
     left: tuple[Floats, Floats] | None = None
-    without = []
+    sums = []
     for j in range(k):
         parts = [part for part in (left, right[j]) if part is not None]
-        Y, y = parts[0] if len(parts) == 1 else (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1])
-        chosen = [i for i in range(k) if i != j]
-        without.append(_inverted(Y, y, least, [xs[i] for i in chosen], [Ps[i] for i in chosen]))
+        sums.append(parts[0] if len(parts) == 1 else (parts[0][0] + parts[1][0], parts[0][1] + parts[1][1]))
         left = (information[j], vectors[j]) if left is None else (left[0] + information[j], left[1] + vectors[j])
     assert left is not None
-    return _inverted(*left, least, xs, Ps), without
+    return _inverted([*sums, left], least, xs, Ps)
 
 
 def _inverted(
-    information: Floats, vector: Floats, least: Floats, xs: list[Floats], Ps: list[Floats]
-) -> tuple[Floats, Floats]:
-    """Mean and covariance of an equal-weight intersection of k sources, from their summed information."""
-    inverse, _, margin = linalg.sweep(information)
-    x, P = linalg.matvec(inverse, vector), inverse * float(len(xs))
-    sound = (np.minimum(least, margin) > SOUND) & np.isfinite(x).all(axis=0) & np.isfinite(P).all(axis=(0, 1))
-    bad = np.flatnonzero(~sound)
-    if len(bad):
-        x[:, bad], P[:, :, bad] = uniform_ci(
-            np.stack([one[:, bad] for one in xs]), np.stack([one[:, :, bad] for one in Ps])
-        )
-    return x, P
+    sums: list[tuple[Floats, Floats]], least: Floats, xs: list[Floats], Ps: list[Floats]
+) -> tuple[tuple[Floats, Floats], list[tuple[Floats, Floats]]]:
+    """Means and covariances of equal-weight intersections of k sources, from their summed information: of all but each,
+    and the last of all. Inverted together: as many calls as for one."""
+    k, count = len(xs), xs[0].shape[1]
+    inverse, _, margin = linalg.sweep(np.concatenate([one for one, _ in sums], axis=2))
+    x = linalg.matvec(inverse, np.concatenate([one for _, one in sums], axis=1))
+    inverse[..., : k * count] *= float(k - 1)
+    inverse[..., k * count :] *= float(k)
+    sound = (np.minimum(np.tile(least, k + 1), margin) > SOUND) & np.isfinite(x).all(axis=0)
+    sound &= np.isfinite(inverse).all(axis=(0, 1))
+    out = []
+    for j in range(k + 1):
+        part = slice(j * count, (j + 1) * count)
+        one, P, bad = x[:, part], inverse[..., part], np.flatnonzero(~sound[part])
+        if len(bad):
+            chosen = [i for i in range(k) if i != j]
+            one[:, bad], P[:, :, bad] = uniform_ci(
+                np.stack([xs[i][:, bad] for i in chosen]), np.stack([Ps[i][:, :, bad] for i in chosen])
+            )
+        out.append((one, P))
+    return out[k], out[:k]

@@ -50,6 +50,10 @@ class Constraints:
 
 def constraints(orders: Orders, rows: Rows, names: tuple[str, ...]) -> Constraints:
     """What the standing orders mean for `rows`; names: all sources, sorted, as `rows.source` counts them."""
+    if not orders.standing:
+        row, ids = np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.uint64)
+        nobody = np.zeros(len(rows.source), dtype=np.bool_)
+        return Constraints(nobody, row, ids, row, ids, row, row, ids.reshape(0, 2))
     held: list[LocalId] = []
     never: list[tuple[LocalId, int]] = []
     forced: list[tuple[LocalId, int]] = []

@@ -15,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import among
 from fusion_service.centre.sources import Source
 from fusion_service.config import CentreConfig
 from schemas import GlobalTracks, tracks_at
@@ -31,7 +32,7 @@ def fed(sources: Iterable[Source]) -> NDArray[np.uint64]:
     for source in sources:
         if source.arrived:
             came = np.concatenate(source.arrived)
-            links.append(source.tracks.link[np.isin(source.tracks.id, came)])
+            links.append(source.tracks.link[among(source.tracks.id, came)])
     return np.unique(np.concatenate(links))
 
 
@@ -43,8 +44,8 @@ class Deltas:
         self._wanted = config.trigger == "arrival" and config.kind == "tracks"
         self._shown: GlobalTracks | None = None
 
-    def of(self, picture: GlobalTracks, new: NDArray[np.uint64]) -> GlobalTracks:
-        """What is published of a picture in which the tracks `new` have got something: itself, or a delta."""
+    def of(self, picture: GlobalTracks, sources: Iterable[Source]) -> GlobalTracks:
+        """What is published of a picture after a step of these sources: itself, or a delta."""
         if not self._wanted:
             return picture
         before, self._shown = self._shown, picture
@@ -52,9 +53,9 @@ class Deltas:
             return picture
         ended = np.array([track for track, _, _ in picture.ended], dtype=np.uint64)
         gone = np.setdiff1d(before.ids, picture.ids, assume_unique=True)
-        if (before.space, before.frame) != (picture.space, picture.frame) or not np.isin(gone, ended).all():
+        if (before.space, before.frame) != (picture.space, picture.frame) or not among(gone, ended).all():
             return picture
-        rows = np.flatnonzero(np.isin(picture.ids, new) | changed(before, picture))
+        rows = np.flatnonzero(among(picture.ids, fed(sources)) | changed(before, picture))
         return replace(tracks_at(picture, rows), delta=True)
 
 

@@ -20,6 +20,7 @@ needs `A` together, of young ones less. A link that was only just made breaks on
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -47,8 +48,9 @@ WEIGHT = ((0, 10, 30), (0.0, 0.1, 0.5))
 since the first pairing of a formation is mostly wrong; two mature ones A together."""
 
 
+@lru_cache(maxsize=256)
 def chi2_by_size(probability: float, n: int) -> Floats:
-    """The chi-square quantile (n + 1,) by how many of n components are in common, 0 for none."""
+    """The chi-square quantile (n + 1,) by how many of n components are in common, 0 for none. Not to be written."""
     return np.array([0.0, *(chi2_quantile(probability, k) for k in range(1, n + 1))])
 
 

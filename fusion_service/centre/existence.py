@@ -20,13 +20,13 @@ each and their sum bounded by `MOST`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Floats, among
 from fusion_service.centre.association import by_size
 from fusion_service.centre.blobs import Shared
 from fusion_service.centre.intake import Intake
@@ -37,6 +37,7 @@ from fusion_service.config import SourceConfig
 from fusion_service.coverage import covers
 from fusion_service.densities import Mixtures, power_product
 from fusion_service.existence import fuse_existence
+from fusion_service.records import altered
 
 __all__ = ["Entries", "update_existence"]
 
@@ -130,7 +131,7 @@ def update_existence(
         r = _sigmoid(opinion + evidence) * config.survival ** (max(time - before, 0) / 1e9)
         evidence = np.where(quiet, np.clip(_logit(r), -MOST, MOST) - opinion, evidence)
     total = np.clip(opinion + evidence + missed, -MOST, MOST)
-    return replace(picture, opinion=opinion, evidence=evidence, existence=_sigmoid(total))
+    return altered(picture, opinion=opinion, evidence=evidence, existence=_sigmoid(total))
 
 
 def _opinions(
@@ -191,9 +192,9 @@ def _missed(
         since = np.where(covered, np.where(since >= 0, np.minimum(since, time), time), -1)
         mine = rows.source == index[name]
         new = mine & rows.fresh & ~rows.tracks.outside
-        seen = np.isin(picture.id, rows.tracks.link[new])
-        says = np.isin(picture.id, rows.tracks.link[new & np.isfinite(rows.tracks.existence)])
-        unsure = np.isin(picture.id, rows.tracks.link[mine & rows.tracks.outside])
+        seen = among(picture.id, rows.tracks.link[new])
+        says = among(picture.id, rows.tracks.link[new & np.isfinite(rows.tracks.existence)])
+        unsure = among(picture.id, rows.tracks.link[mine & rows.tracks.outside])
         missed = covered & ~seen & ~unsure & (time - since >= said.initiation_delay * 1e9)
         missed = shared.still_missed(index[name], missed)
         p = min(float(said.detection_probability or 0.0), MOST_CERTAIN)

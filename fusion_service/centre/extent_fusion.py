@@ -13,7 +13,6 @@ may be several objects, says nothing of the extent of one.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -23,6 +22,7 @@ from fusion_service.centre.extents import BLOB
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.tracks import FUSED_ROWS
+from fusion_service.records import altered
 from schemas import MAX_EXTENT, SHAPES
 
 __all__ = ["extent_columns", "fused_extents"]
@@ -55,10 +55,10 @@ def fused_extents(rows: Rows, picture: Picture, seconds: float) -> Picture:
         box[at] = boxes
     spread[np.isnan(known)] = np.nan
     if np.isnan(known).all():
-        return replace(picture, extent=np.zeros((0, len(picture.id))))
+        return altered(picture, extent=np.zeros((0, len(picture.id))))
     extent = np.concatenate([known, spread, box[None]])
     assert len(extent) == FUSED_ROWS
-    return replace(picture, extent=extent)
+    return altered(picture, extent=extent)
 
 
 def _said(rows: Rows, picture: Picture) -> tuple[Ints, Floats, Floats, Floats]:

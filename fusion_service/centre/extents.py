@@ -17,7 +17,6 @@ on a box length^2 / 12 and width^2 / 12. Where only the length is known the obje
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
@@ -28,6 +27,7 @@ from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.tracks import EXTENT_ROWS, Tracks
 from fusion_service.geodesy import axis_turn, level_axes
+from fusion_service.records import altered
 from schemas import REFERENCES, SHAPES, Ecef, Frame, LocalTracks
 
 __all__ = ["BLOB", "message_extents", "off_centre", "shaped", "turned", "widened", "with_reference"]
@@ -80,7 +80,7 @@ def turned(tracks: Densities, space: tuple[str, ...], frame: Frame, wanted: Fram
     """Tracks of which all but the extents has been brought from `frame` into `wanted`, with these too."""
     if not len(tracks.extent):
         return tracks
-    return replace(tracks, extent=_turned(tracks.extent, axis_turn(tracks.mean, space, frame, wanted)))
+    return altered(tracks, extent=_turned(tracks.extent, axis_turn(tracks.mean, space, frame, wanted)))
 
 
 def _turned(column: Floats, angle: Floats) -> Floats:
@@ -129,7 +129,7 @@ def shaped(rows: Rows, now: Picture, space: tuple[str, ...], frame: Frame | None
     if len(column):
         spread = _spread(column[0], column[1], column[2], _share(column[6]))
         spread = np.where(np.isnan(column[8:11]), spread, 0.0)
-        rows = replace(rows, tracks=widened(rows.tracks, spread, space, frame))
+        rows = altered(rows, tracks=widened(rows.tracks, spread, space, frame))
     return rows, now
 
 
@@ -150,7 +150,7 @@ def widened(tracks: Densities, spread: Floats, space: tuple[str, ...], frame: Fr
         return tracks
     more = _in_space(tracks.mean, spread, space, frame)
     covariance, parts = tracks.covariance + more, tracks.part_covariance + more[:, :, None]
-    return replace(tracks, covariance=covariance, part_covariance=parts)
+    return altered(tracks, covariance=covariance, part_covariance=parts)
 
 
 def _in_space(means: Floats, spread: Floats, space: tuple[str, ...], frame: Frame | None) -> Floats:

@@ -9,14 +9,14 @@ every source by the existence it reports. With recursive memory the predicted la
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, picked
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
@@ -28,6 +28,7 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.tracks import no_parts, padded
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures, reduce_mixtures
+from fusion_service.records import altered
 from fusion_service.rules import MIXTURE_RULES, RULES, Fused, fuse_last
 from fusion_service.rules.mixtures import fuse_mixtures_last
 from schemas import Entry
@@ -56,11 +57,11 @@ def fuse_all(
     linked = linked if left is None else linked & ~left
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
     chosen = np.flatnonzero(used)
-    mean, covariance, lineage = picture.mean.copy(), picture.covariance.copy(), picture.lineage.copy()
-    way = picture.way.copy()
+    lineage, way = picture.lineage.copy(), picture.way.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
-    done: list[Ints] = []
+    done: list[Ints] = [np.zeros(0, dtype=np.intp)]
+    states: list[tuple[Floats, Floats]] = []
     unknown = Unknown.of(config.space)
     for ids, groups in by_size(tracks.link[chosen]):
         at, members = picture.find(ids), chosen[groups]
@@ -73,13 +74,31 @@ def fuse_all(
             old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
                 _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound, unknown)
-        mean[:, at], covariance[:, :, at], state_time[at], way[at] = one, spread, time, by
+        state_time[at], way[at] = time, by
+        states.append((one, spread))
         lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory == "recursive")
         influence[members] = gains.T
         done.append(at)
     tracks.used[chosen] = tracks.time[chosen]
-    picture = replace(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
-    return with_parts(picture, np.concatenate(done) if done else np.zeros(0, dtype=np.intp), mixed), influence
+    at = np.concatenate(done)
+    mean, covariance = _placed(picture, at, states)
+    picture = altered(picture, mean=mean, covariance=covariance, time=state_time, lineage=lineage, way=way)
+    return with_parts(picture, at, mixed), influence
+
+
+def _placed(picture: Picture, at: Ints, states: list[tuple[Floats, Floats]]) -> tuple[Floats, Floats]:
+    """Means and covariances of the picture, those of the tracks `at` (K,) being `states`, one after the other."""
+    if len(states) == 1 and len(at) == len(picture.id):
+        return states[0]
+    if not states:
+        return picture.mean, picture.covariance
+    ones, spreads = (np.concatenate(part, axis=-1) for part in zip(*states, strict=True))
+    if len(at) == len(picture.id):
+        order = np.argsort(at)
+        return ones.take(order, axis=-1), spreads.take(order, axis=-1)
+    mean, covariance = picture.mean.copy(), picture.covariance.copy()
+    mean[:, at], covariance[:, :, at] = ones, spreads
+    return mean, covariance
 
 
 def _gaussian(
@@ -87,12 +106,15 @@ def _gaussian(
 ) -> tuple[Floats, Floats, Floats, Ways]:
     """Means, covariances and gains of groups (B, k), and what each was fused by (see `Correlation.fuse`)."""
     config = known.config
-    means = np.stack([picked(rows.tracks.mean, one) for one in members.T])
-    covariances = np.stack([picked(rows.tracks.covariance, one) for one in members.T])
-    related = kinship.is_related(rows, members) & (config.rule not in kinship.ANY_CORRELATION)
+    # in memory (n, k, B): as the rules have it
+    means = rows.tracks.mean.take(members.T, axis=-1).transpose(1, 0, 2)
+    covariances = rows.tracks.covariance.take(members.T, axis=-1).transpose(2, 0, 1, 3)
+    related = np.zeros(len(members), dtype=np.bool_)
+    if config.rule not in kinship.ANY_CORRELATION:
+        related = kinship.is_related(rows, members)
     by = np.zeros(len(members), dtype=np.uint8)
     ruled = Ruled(rows, members, known, unknown, journal)
-    if related.all():
+    if len(related) and related.all():
         one, spread, gains = ruled.kin(means, covariances)
     else:
         weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
@@ -140,7 +162,7 @@ class Ruled:
     def kin(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
         """Groups whose rows have data in common (see `kinship`): what is derived of rows holds for no result of
         them."""
-        ruled = replace(self, known=replace(self.known, followed=None, kept=None))
+        ruled = altered(self, known=altered(self.known, followed=None, kept=None))
 
         def by_rule(x: Floats, P: Floats, which: list[int], some: Ints) -> kinship.Estimates:
             return kinship.Estimates(*ruled.fuse(x, P, None, some, np.zeros(len(some), dtype=np.uint8), which))
@@ -237,7 +259,7 @@ def with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]])
         columns = no_parts(len(picture.mean), len(picture.id))
     else:
         columns = log_weight[:needed], means[:, :needed], covariances[:, :, :needed]
-    return replace(picture, log_weight=columns[0], part_mean=columns[1], part_covariance=columns[2])
+    return altered(picture, log_weight=columns[0], part_mean=columns[1], part_covariance=columns[2])
 
 
 def _influence(fused: Fused) -> Floats:

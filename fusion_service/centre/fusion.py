@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import among
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
 from fusion_service.centre.blobs import Blobs, Shared
@@ -25,6 +25,7 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.supervision import Supervisor
 from fusion_service.centre.tracks import relinked
 from fusion_service.config import CentreConfig
+from fusion_service.records import altered
 
 __all__ = ["FusionCentre"]
 
@@ -119,11 +120,11 @@ class FusionCentre(Centre):
         old = np.array(sorted(new), dtype=np.uint64)
         to = np.array([new[track] for track in old.tolist()], dtype=np.uint64)
         for source in self._intake.sources.values():
-            at = np.flatnonzero(np.isin(source.tracks.link, old))
+            at = np.flatnonzero(among(source.tracks.link, old))
             if len(at):
                 link = to[np.searchsorted(old, source.tracks.link[at])]
-                double = np.isin(link, np.delete(source.tracks.link, at))
-                double |= ~np.isin(np.arange(len(at)), np.unique(link, return_index=True)[1])
+                double = among(link, np.delete(source.tracks.link, at))
+                double |= ~among(np.arange(len(at)), np.unique(link, return_index=True)[1])
                 link = np.where(double, NO_TRACK, link)
                 source.tracks = relinked(source.tracks, at, link, self._step)
 
@@ -138,10 +139,11 @@ class FusionCentre(Centre):
         )
         self._relink(merged)
         if merged:
-            gone = np.isin(self._picture.id, np.array(list(merged), dtype=np.uint64))
+            gone = among(self._picture.id, np.array(list(merged), dtype=np.uint64))
             self._picture, now = self._picture.take(~gone), now.take(~gone[:count])
             count = len(now.id)
-        now = now.join(self._picture.take(slice(count, None)))
+        if len(self._picture.id) > count:
+            now = now.join(self._picture.take(slice(count, None)))
         if (order := now.order()) is not None:  # a step made again gives ids that are known
             self._picture, now = self._picture.take(order), now.take(order)
         return now
@@ -154,13 +156,13 @@ class FusionCentre(Centre):
         np.maximum.at(updated, at, tracks.updated[inside])
         np.maximum.at(newest, at, tracks.time[inside])
         seen = np.maximum(picture.seen, newest)
-        picture = replace(picture, updated=updated, seen=seen)
+        picture = altered(picture, updated=updated, seen=seen)
         picture = update_existence(rows, picture, self._intake, self._entries, time, self._last, shared)
         support = self._support(rows, shared, inside, at, len(picture.id), time)
         self._last = time
         picture, ended = live_on(picture, time, support, self.config, self._journal)
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
-        tracks.link[np.isin(tracks.link, picture.id[ended])] = NO_TRACK
+        tracks.link[among(tracks.link, picture.id[ended])] = NO_TRACK
         self._picture = picture.take(~ended)
 
     def _support(
@@ -171,9 +173,9 @@ class FusionCentre(Centre):
         interval = rows.interval[inside]
         slack = np.maximum(interval // 2, round(self.config.period * 1e9))
         expected = rows.tracks.seen[inside] + interval + np.where(rows.lost[inside], 0, slack)
-        expected = np.where(
-            self._intake.spared.of(self._intake.names())[rows.source[inside]], np.maximum(expected, time), expected
-        )
+        spared = self._intake.spared.of(self._intake.names())
+        if spared.any():
+            expected = np.where(spared[rows.source[inside]], np.maximum(expected, time), expected)
         due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
         np.maximum.at(due, at, expected)
         np.maximum.at(slowest, at, interval)
@@ -184,8 +186,8 @@ class FusionCentre(Centre):
         whole = np.full(len(rows.source), -1, dtype=np.int64)
         whole[inside] = expected
         left = shared.support(due, whole, linked == 0)
-        unlisted = [links for source in self._intake.sources.values() for links in source.dropped]
-        dropped = left & np.isin(self._picture.id, np.concatenate([NOTHING, *unlisted]))
+        unlisted = [links for source in self._intake.sources.values() for links in source.dropped if len(links)]
+        dropped = left & among(self._picture.id, np.concatenate([NOTHING, *unlisted]))
         return Support(sources, hit, due, slowest, left, dropped, self._last)
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, picked
+from fusion_service.arrays import Bools, Floats, Ints, among, picked, subset
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -53,13 +53,18 @@ def manoeuvred(space: tuple[str, ...], acceleration: float, seconds: Floats) -> 
     """Covariance (n, n, M) of what a constant unknown acceleration (one sigma, m/s2, each axis alike) makes of a
     state in so many seconds (M,)."""
     spread = np.zeros((len(space), len(space), len(seconds)))
+    _add_manoeuvre(spread, space, acceleration, seconds)
+    return spread
+
+
+def _add_manoeuvre(spread: Floats, space: tuple[str, ...], acceleration: float, seconds: Floats) -> None:
+    """Add what `manoeuvred` gives to covariances (n, n, M)."""
     gains = (0.5 * seconds**2, seconds, np.ones_like(seconds))
     for axis in AXES:
         there = [(space.index(name), gain) for name, gain in zip(axis, gains, strict=True) if name in space]
         for i, one in there:
             for j, other in there:
-                spread[i, j] = acceleration**2 * one * other
-    return spread
+                spread[i, j] += acceleration**2 * one * other
 
 
 def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings, journal: Journal) -> Judgement:
@@ -72,18 +77,18 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     jumped = fresh & (predicted > tests.keep[seen])
     outside = np.where(fresh, jumped, tracks.outside[linked])
     some = np.flatnonzero(~outside if rows.out is None else ~outside & ~rows.out[linked])
-    agreed = consensus(links[some], picked(tracks.mean, linked[some]), picked(tracks.covariance, linked[some]))
+    agreed = consensus(links[some], subset(tracks.mean, linked[some]), subset(tracks.covariance, linked[some]))
     distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
     failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep[shared])
     outside[failed] = True
     agreement, jump = tests.agreement(distance, shared), tests.jump(predicted, seen)
-    _weigh(rows, linked, agreement, jump, jumped, agreed.size, some, tests.bound)
+    _weigh(rows, linked, agreement, jump, jumped, agreed.groups, agreed.size, some, tests.bound)
     tracks.outside[linked] = outside
     tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
     tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
     tracks.data[linked] += fresh
-    may = fresh & ~np.isin(linked, forced)
+    may = fresh & ~among(linked, forced)
     broken, was = _break(rows, linked, links, may, distance, predicted, tests, journal)
     stays = tracks.link[linked] != NO_TRACK
     shown = np.where(np.isnan(distance), np.where(outside, predicted, np.nan), distance)
@@ -98,21 +103,25 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
 def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensus:
     """What the rows `inside` say together, from what all of `had` said: only tracks that lost one are fused anew."""
     tracks = rows.tracks
-    kept = np.isin(had, inside)
+    mark = np.zeros(len(rows.source), dtype=np.bool_)
+    mark[inside] = True
+    kept = np.flatnonzero(mark[had])
     links = tracks.link[inside]
-    labels, group = np.unique(links, return_inverse=True)
-    at = np.searchsorted(agreed.labels, labels)
+    place = np.searchsorted(agreed.labels, links)
+    count = np.bincount(place, minlength=len(agreed.labels))
+    at = np.flatnonzero(count)
+    labels = agreed.labels[at]
     mean, covariance = picked(agreed.mean, at), picked(agreed.covariance, at)
     others_mean, others_covariance = picked(agreed.others_mean, kept), picked(agreed.others_covariance, kept)
     size = agreed.size[kept]
-    fewer = np.flatnonzero(size != np.bincount(group, minlength=len(labels))[group])
+    fewer = np.flatnonzero(size != count[place])
     some = inside[fewer]
     anew = consensus(links[fewer], picked(tracks.mean, some), picked(tracks.covariance, some))
     changed = np.searchsorted(labels, anew.labels)
     mean[:, changed], covariance[:, :, changed] = anew.mean, anew.covariance
     others_mean[:, fewer], others_covariance[:, :, fewer] = anew.others_mean, anew.others_covariance
     size[fewer] = anew.size
-    return Consensus(labels, mean, covariance, others_mean, others_covariance, size)
+    return Consensus(labels, mean, covariance, others_mean, others_covariance, size, [])
 
 
 def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings: Settings) -> tuple[Floats, Ints]:
@@ -121,21 +130,27 @@ def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings
     tracks = rows.tracks
     at = now.find(tracks.link[linked])
     seconds = np.maximum(time - now.seen[at], 0) / 1e9
-    spread = picked(tracks.covariance, linked) + picked(now.covariance, at)
-    spread += manoeuvred(settings.space, settings.manoeuvre, seconds)
+    spread = subset(tracks.covariance, linked) + picked(now.covariance, at)
+    _add_manoeuvre(spread, settings.space, settings.manoeuvre, seconds)
     size, _ = settings.tests.unknown.common(spread)
-    distance = linalg.quadratic(spread, picked(tracks.mean, linked) - picked(now.mean, at))
+    distance = linalg.quadratic(spread, subset(tracks.mean, linked) - picked(now.mean, at))
     return np.where(now.time[at] >= 0, np.where(np.isnan(distance), np.inf, distance), 0.0), size
 
 
 def _from_others(rows: Rows, some: Ints, agreed: Consensus, tests: Tests) -> tuple[Floats, Ints]:
     """d2 (S,) of each row to the others of its track, NaN where it is alone, and over how many components."""
     distance, size = np.full(len(some), np.nan), np.zeros(len(some), dtype=np.intp)
-    several = np.flatnonzero(agreed.size > 1)
-    at = some[several]
-    spread = picked(rows.tracks.covariance, at) + picked(agreed.others_covariance, several)
-    distance[several] = linalg.quadratic(spread, picked(rows.tracks.mean, at) - picked(agreed.others_mean, several))
-    size[several], _ = tests.unknown.common(spread)
+    mean, covariance = rows.tracks.mean, rows.tracks.covariance
+    for members in agreed.groups:
+        if members.shape[1] < 2:
+            continue
+        of_two = members.shape[1] == 2  # as far from each other both ways, to the bit
+        at = members[:, 0] if of_two else members.reshape(-1)
+        spread = picked(covariance, some[at]) + picked(agreed.others_covariance, at)
+        apart = linalg.quadratic(spread, picked(mean, some[at]) - picked(agreed.others_mean, at))
+        common, _ = tests.unknown.common(spread)
+        distance[members] = apart[:, None] if of_two else apart.reshape(members.shape)
+        size[members] = common[:, None] if of_two else common.reshape(members.shape)
     return distance, size
 
 
@@ -145,7 +160,9 @@ def _worst(
     """Of the bad rows of each global track with new data the one to leave out: farthest from the others, then from
     the prediction, then youngest, then last in order."""
     at = np.flatnonzero(bad)
-    at = at[np.isin(links[at], links[fresh])]
+    if not len(at):
+        return at
+    at = at[among(links[at], links[fresh])]
     if not len(at):
         return at
     order = np.lexsort((-at, -since[at], -predicted[at], -distance[at], links[at]))
@@ -154,12 +171,13 @@ def _worst(
 
 
 def _weigh(
-    rows: Rows, linked: Ints, agreement: Floats, jump: Floats, jumped: Bools, size: Ints, some: Ints, bound: float
-) -> None:
+    rows: Rows, linked: Ints, agreement: Floats, jump: Floats, jumped: Bools, groups: list[Ints], size: Ints,
+    some: Ints, bound: float,
+) -> None:  # fmt: skip
     """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
     tracks, fresh = rows.tracks, rows.fresh[linked]
     others = np.full(len(linked), -1, dtype=np.int64)
-    others[some] = _newest_other(tracks.link[linked[some]], tracks.updated[linked[some]])
+    others[some] = _newest_other(groups, tracks.updated[linked[some]])
     together = np.zeros(len(linked), dtype=np.bool_)
     together[some] = size > 1
     weighed = fresh & together & ~jumped & (others > tracks.weighed[linked])
@@ -170,17 +188,16 @@ def _weigh(
     tracks.weighed[linked] = np.where(weighed, others, tracks.weighed[linked])
 
 
-def _newest_other(links: NDArray[np.uint64], updated: NDArray[np.int64]) -> NDArray[np.int64]:
-    """For each row the newest datum of the other rows of its track, -1 without any."""
-    order = np.lexsort((updated, links))
-    last = np.append(links[order][1:] != links[order][:-1], True) if len(order) else np.zeros(0, dtype=np.bool_)
-    begins = np.append(True, last[:-1]) if len(order) else last
-    group = np.cumsum(begins) - 1
-    top = order[last]
-    newest = updated[top][group]
-    second = np.where(begins[last], -1, updated[order][np.flatnonzero(last) - 1])[group]
-    out = np.empty(len(order), dtype=np.int64)
-    out[order] = np.where(last, second, newest)
+def _newest_other(groups: list[Ints], updated: NDArray[np.int64]) -> NDArray[np.int64]:
+    """For each row the newest datum of the other rows of its track, -1 without any; groups as of `Consensus`."""
+    out = np.full(len(updated), -1, dtype=np.int64)
+    for members in groups:
+        if members.shape[1] == 2:
+            out[members] = updated[members[:, ::-1]]
+        elif members.shape[1] > 2:
+            when = updated[members]
+            second, newest = np.sort(when, axis=1)[:, -2:].T
+            out[members] = np.where(when == newest[:, None], second[:, None], newest[:, None])
     return out
 
 
@@ -196,7 +213,7 @@ def _break(
     worst = _worst(links, may, predicted, shown, tracks.since[linked], ripe)
     if len(worst):
         journal.broke(rows, linked[worst], links[worst], shown[worst])
-        again = np.isin(links, links[worst])
+        again = among(links, links[worst])
         tracks.evidence[linked[again]] = np.maximum(tracks.evidence[linked[again]], 0.0)
         set_links(tracks, linked[worst], NO_TRACK, -1)
     return linked[worst], links[worst]

@@ -12,17 +12,18 @@ to "two objects" (with `POPULATION` identities about), and forbids what trusted 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Floats, Ints, among
 from fusion_service.centre.beliefs import OPEN, Beliefs, learned, no_beliefs
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.words import NONE, Codes
+from fusion_service.records import altered
 
 __all__ = ["MOST_CLASSES", "POPULATION", "TRUSTED", "Identities", "Terms"]
 
@@ -64,15 +65,15 @@ class Identities:
             return
         self.identity, self.kind = (_inherited(one, heirs) for one in (self.identity, self.kind))
         new = np.flatnonzero(says & (tracks.link != NO_TRACK) & ~tracks.outside & (tracks.updated > tracks.told))
-        new = new[np.isin(tracks.link[new], ids)]
+        new = new[among(tracks.link[new], ids)]
         known = np.concatenate([self.identity.track, self.kind.track])
-        new = new[~rows.echo[new] | ~np.isin(tracks.link[new], known)]  # its own word is no news to a centre
+        new = new[~rows.echo[new] | ~among(tracks.link[new], known)]  # its own word is no news to a centre
         if len(new):
             self._hear(rows, new)
             tracks.told[new] = tracks.updated[new]
             self._write_back(rows)
         self._obey(ids)
-        self.identity, self.kind = (one.take(np.isin(one.track, ids)) for one in (self.identity, self.kind))
+        self.identity, self.kind = (one.take(among(one.track, ids)) for one in (self.identity, self.kind))
 
     def _hear(self, rows: Rows, new: Ints) -> None:
         tracks = rows.tracks
@@ -107,7 +108,7 @@ class Identities:
         start = 0
         for name, count in rows.kept.items():
             source = self._intake.sources[name]
-            source.tracks = replace(source.tracks, told=rows.tracks.told[start : start + count])
+            source.tracks = altered(source.tracks, told=rows.tracks.told[start : start + count])
             start += count
 
     def schemes(self) -> Codes:
@@ -115,7 +116,7 @@ class Identities:
         return self._intake.said.identity.schemes()
 
     def _classes(self) -> int:
-        return int(np.clip(len(self._intake.said.kind.texts), 2, MOST_CLASSES))
+        return min(max(len(self._intake.said.kind.texts), 2), MOST_CLASSES)
 
     def _stated(self, setting: str, source: Ints) -> Floats:
         """A setting of each of the sources (indices into the sorted names)."""
@@ -174,7 +175,7 @@ class Identities:
         known = at >= 0
         unbelieved = np.ones(len(said), dtype=np.bool_)
         unbelieved[known] = (best[0][at[known]] != code[known]) | (best[1][at[known]] < TRUSTED)
-        order = np.lexsort((said, since, unbelieved, ~np.isin(said, sure), question, link))
+        order = np.lexsort((said, since, unbelieved, ~among(said, sure), question, link))
         new = np.append(True, (np.diff(link[order]) != 0) | (np.diff(question[order]) != 0))
         stays = code[order][new][np.cumsum(new) - 1]
         odd: Ints = np.sort(said[order][code[order] != stays])
@@ -194,7 +195,7 @@ class Identities:
         tracks = np.unique(link)
         keys = np.searchsorted(tracks, link) * width + question
         order = np.argsort(keys, kind="stable")
-        pairs = np.flatnonzero(np.isin(row, mine) & np.isin(track, tracks))
+        pairs = np.flatnonzero(among(row, mine) & among(track, tracks))
         place = np.searchsorted(mine, row[pairs])
         wanted = np.searchsorted(tracks, track[pairs]) * width + asked[place]
         at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
@@ -237,9 +238,9 @@ class Identities:
             if new is None:
                 continue
             for source in self._intake.sources.values():
-                source.tracks = replace(source.tracks, **{name: new[getattr(source.tracks, name)]})
+                source.tracks = altered(source.tracks, **{name: new[getattr(source.tracks, name)]})
             question = new[beliefs.question] if name == "identity" else beliefs.question
-            setattr(self, name, replace(beliefs, code=new[beliefs.code], question=question))
+            setattr(self, name, altered(beliefs, code=new[beliefs.code], question=question))
 
     def kept(self) -> dict[str, Any]:
         """What a checkpoint holds of it, as plain values."""
@@ -253,7 +254,7 @@ class Identities:
 def _inherited(beliefs: Beliefs, heirs: Mapping[int, int]) -> Beliefs:
     """With what was known of tracks that go on as others."""
     old = np.array(sorted(heirs), dtype=np.uint64)
-    at = np.flatnonzero(np.isin(beliefs.track, old))
+    at = np.flatnonzero(among(beliefs.track, old))
     if not len(at):
         return beliefs
     new = np.array([heirs[track] for track in old.tolist()], dtype=np.uint64)

@@ -20,7 +20,7 @@ from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.events import Event, Refused, Skipped, SourceFound, SourceLost
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
 from fusion_service.centre.heights import with_height
-from fusion_service.centre.intervals import Pace, silence
+from fusion_service.centre.intervals import Pace, silence_of
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.limits import (
     MAX_COMPONENTS,
@@ -161,7 +161,9 @@ class Intake:
 
     def declared(self, source: Source) -> SourceConfig:
         """What holds for a source: its own word, else the config's; with `override` the other way round."""
-        return declared_by(self.config.source(source.name), source.info)
+        if source.declared is None or source.declared[0] is not source.info:
+            source.declared = source.info, declared_by(self.config.source(source.name), source.info)
+        return source.declared[1]
 
     def motion_said(self, source: Source) -> Motion | None:
         """How its tracks move, if anybody says so."""
@@ -191,8 +193,7 @@ class Intake:
         return source.last < 0 or time - source.last > self._silence(source)
 
     def _silence(self, source: Source) -> int:
-        interval = np.array([self.pace(source, complete=True).first])
-        return int(silence(interval, self.declared(source), self.config)[0])
+        return silence_of(self.pace(source, complete=True).first, self.declared(source), self.config)
 
     def rebase(self, time: int, now: int) -> None:
         """A new era begins at `time`, ns: nothing that is known is later, nor did it come after `now`."""
@@ -356,7 +357,7 @@ class Intake:
             batch = [item for _, item in run]
             source, first, _ = batch[0][0]
             for (_, _, entry), faults in batch:
-                for code in np.unique(faults[faults > 0]).tolist():
+                for code in np.unique(faults[faults > 0]).tolist() if faults.any() else ():
                     journal.refuse(replace(entry, reason=FAULTS[code], count=int((faults == code).sum())))
             sound = [faults == 0 for _, faults in batch]
             messages = [message for (_, message, _), _ in batch]

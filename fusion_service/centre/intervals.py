@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from fusion_service.config import CentreConfig, SourceConfig
 
-__all__ = ["NOTHING_REMEMBERED", "Pace", "Remembered", "follow", "intervals", "remember", "silence"]
+__all__ = ["NOTHING_REMEMBERED", "Pace", "Remembered", "follow", "intervals", "remember", "silence", "silence_of"]
 
 I64 = NDArray[np.int64]
 
@@ -64,6 +64,13 @@ def silence(interval: I64, said: SourceConfig, config: CentreConfig) -> I64:
     return np.asarray(
         np.rint(config.stale_periods * interval).astype(np.int64) + round(config.lateness * 1e9), dtype=np.int64
     )
+
+
+def silence_of(interval: int, said: SourceConfig, config: CentreConfig) -> int:
+    """`silence` of one."""
+    if said.stale is not None:
+        return round(said.stale * 1e9)
+    return round(config.stale_periods * interval) + round(config.lateness * 1e9)
 
 
 def intervals(id: NDArray[np.uint64], time: I64, known: Remembered, pace: Pace) -> I64:

@@ -12,13 +12,14 @@ that had any, brought to a sum of 1: whatever numbers stand here are tried by th
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints, from_bytes, to_bytes
+from fusion_service.arrays import Floats, Ints, among, from_bytes, to_bytes
+from fusion_service.records import columns_of
 
 __all__ = ["STEPS", "Ids", "KeptWeights"]
 
@@ -41,11 +42,17 @@ class _Kept:
     age: NDArray[np.int64]
 
     def take(self, at: Any) -> _Kept:
-        return _Kept(*(getattr(self, one.name)[..., at] for one in fields(self)))
+        return _Kept(*(column[..., at] for column in columns_of(self)))
+
+    def by_id(self) -> _Kept:
+        """Sorted."""
+        return self if (self.id[1:] > self.id[:-1]).all() else self.take(np.argsort(self.id, kind="stable"))
 
     def join(self, *others: _Kept) -> _Kept:
-        parts = [self, *others]
-        return _Kept(*(np.concatenate([getattr(part, one.name) for part in parts], axis=-1) for one in fields(self)))
+        if not others:
+            return self
+        columns = zip(*map(columns_of, (self, *others)), strict=True)
+        return _Kept(*(np.concatenate(column, axis=-1) for column in columns))
 
 
 class KeptWeights:
@@ -88,20 +95,17 @@ class KeptWeights:
         after = {count: parts[0].join(*parts[1:]) for count, parts in self._next.items()}
         for count, old in self._last.items():
             new = after.get(count)
-            stays = old.age < STEPS if new is None else (old.age < STEPS) & ~np.isin(old.id, new.id)
+            stays = old.age < STEPS if new is None else (old.age < STEPS) & ~among(old.id, new.id)
             if stays.any():
                 kept = old.take(stays)
                 kept = _Kept(kept.id, kept.source, kept.weight, kept.age + 1)
                 after[count] = kept if new is None else new.join(kept)
-        self._last = {count: kept.take(np.argsort(kept.id, kind="stable")) for count, kept in sorted(after.items())}
+        self._last = {count: kept.by_id() for count, kept in sorted(after.items())}
         self._next = {}
 
     def packed(self) -> list[list[Any]]:
         """As plain values."""
-        return [
-            [count, *(to_bytes(getattr(kept, one.name)) for one in fields(kept))]
-            for count, kept in sorted(self._last.items())
-        ]
+        return [[count, *map(to_bytes, columns_of(kept))] for count, kept in sorted(self._last.items())]
 
     def restore(self, packed: list[list[Any]]) -> None:
         """From what `packed` gave."""

@@ -14,7 +14,6 @@ not keep a target alive by telling each other of it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -26,6 +25,7 @@ from fusion_service.centre.lineage import ANYONE, Codes, Kin, overlapping
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig
+from fusion_service.records import altered
 from fusion_service.rules import fuse_last
 
 __all__ = [
@@ -93,7 +93,7 @@ def new_only(rows: Rows, updated: Ints, at: Ints, inside: Ints) -> Rows:
         return rows
     fresh, existence = rows.fresh.copy(), np.where(rows.echo, np.nan, rows.tracks.existence)
     fresh[inside] &= ~rows.echo[inside] | (rows.tracks.updated[inside] > updated[at])
-    return replace(rows, fresh=fresh, tracks=replace(rows.tracks, existence=existence))
+    return altered(rows, fresh=fresh, tracks=altered(rows.tracks, existence=existence))
 
 
 def separate(rows: Rows, some: Ints) -> Bools:

@@ -74,9 +74,13 @@ class Labels:
         number, callsign = self._called(ids)
         # an intensity is of all sources, and so are its tracks
         own = self.compartments.origin[at] if self._intake.config.kind == "tracks" else np.zeros(0, dtype=np.uint8)
+        called: dict[str, Any] = {}
+        if (identity != NONE).any():
+            called |= {"identity": said.identity.said(identity), "identity_p": identity_p}
+        if (kind != NONE).any():
+            called |= {"kind": said.kind.said(kind), "kind_p": kind_p}
         return {
-            **_if((identity != NONE).any(), identity=said.identity.said(identity), identity_p=identity_p),
-            **_if((kind != NONE).any(), kind=said.kind.said(kind), kind_p=kind_p),
+            **called,
             **_if((own != ORIGINS.index(origin)).any(), track_origin=own),
             **_if(marks.any(), marks=marks),
             **_if(number.any(), number=number),
@@ -85,7 +89,8 @@ class Labels:
 
     def _marks(self, ids: Ids, at: NDArray[np.intp]) -> NDArray[np.uint8]:
         twice, ordered = ([*some] for some in (self.twice.tracks(), self.identities.ordered()))
-        marks = np.where(self.compartments.apart[at] != NONE, APART, 0).astype(np.uint8)
+        marks = np.zeros(len(ids), dtype=np.uint8)
+        marks[self.compartments.apart[at] != NONE] = APART
         for tracks, bit in ((twice, IDENTITY_TWICE), (ordered, IDENTITY_ORDERED)):
             if tracks:
                 marks[np.isin(ids, np.array(tracks, dtype=np.uint64))] |= bit
@@ -93,6 +98,8 @@ class Labels:
 
     def _called(self, ids: Ids) -> tuple[NDArray[np.uint32], list[str | None]]:
         number = np.zeros(len(ids), dtype=np.uint32)
+        if not self._intake.orders.about("rename"):
+            return number, []
         callsign: list[str | None] = [None] * len(ids)
         for one in self._intake.orders.standing.values():
             if one.order.what == "rename" and one.order.track is not None:

@@ -12,7 +12,7 @@ tracks otherwise is overdue since the last step that had one. How often the cent
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, cast
 
 import numpy as np
@@ -23,6 +23,7 @@ from fusion_service.centre.lineage import NOBODY
 from fusion_service.centre.tracks import as_mixtures, join_tracks, no_parts, taken
 from fusion_service.config import CentreConfig
 from fusion_service.densities import Mixtures
+from fusion_service.records import altered
 from schemas.messages import COASTING, CONFIRMED, TENTATIVE
 
 __all__ = ["WAYS", "Picture", "Support", "advance", "empty_picture", "newborn"]
@@ -162,7 +163,7 @@ def advance(picture: Picture, time: int, support: Support, config: CentreConfig)
     due = np.where(support.dropped, np.minimum(due, time + interval + interval // 2 - patience), due)
     ended = overdue & ((time - due > patience) | weak)
     status = status.astype(np.uint8)
-    return replace(picture, status=status, hits=hits, last_hit=last, due=due, interval=interval), ended
+    return altered(picture, status=status, hits=hits, last_hit=last, due=due, interval=interval), ended
 
 
 def _counted(

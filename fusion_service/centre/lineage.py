@@ -27,6 +27,7 @@ Masks = NDArray[np.uint64]
 ALONE = -1
 """Of a local track: its source alone. Of a global track: not known, as `ANYONE`."""
 NOBODY, ANYONE = 0, 1
+_NONE, _NO_BITS = np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.uint8)
 MOST_NAMES = 4096
 MOST_SETS = 16_384
 ROOM = 1000
@@ -52,6 +53,7 @@ class Lineages:
         self._sets: list[int] = [0, 1]
         self._codes: dict[int, int] = {0: NOBODY, 1: ANYONE}
         self._table: Masks = np.array([[0, 1]], dtype=np.uint64)
+        self._last: tuple[Any, Codes, tuple[tuple[str, ...], NDArray[np.uint8]]] = None, _NONE, ((), _NO_BITS)
 
     def __len__(self) -> int:
         return len(self._sets)
@@ -125,6 +127,10 @@ class Lineages:
     def told(self, codes: Codes, known: Iterable[str], own: str) -> tuple[tuple[str, ...], NDArray[np.uint8]]:
         """What a picture says: the names that are in it, `own` the last, and the bits (T, ceil(L/8)) of its tracks.
         known: names that it tells in any case."""
+        known = tuple(known)
+        asked = known, own, len(self._sets), len(self.names)
+        if asked == self._last[0] and len(codes) == len(self._last[1]) and (codes == self._last[1]).all():
+            return self._last[2]
         masks = self.masks(codes)
         words = np.bitwise_or.reduce(masks, axis=1).tolist()
         used = [k for k in range(1, len(self.names)) if words[k // 64] >> (k % 64) & 1]
@@ -136,7 +142,9 @@ class Lineages:
             bits[:, place[self.names[k]]] = masks[k // 64] >> np.uint64(k % 64) & np.uint64(1) == 1
         bits[anyone] = True
         bits[:, -1] = True
-        return names, np.packbits(bits, axis=1, bitorder="little")
+        told = names, np.packbits(bits, axis=1, bitorder="little")
+        self._last = asked, codes.copy(), told
+        return told
 
     def compacted(self, used: Sequence[Codes]) -> Codes | None:
         """Forget the sets, and names, that no column uses, where they are many: the new code of each old one, to index

@@ -10,7 +10,6 @@ one.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, among
 from fusion_service.centre.births import group, locals_of
 from fusion_service.centre.candidates import Candidates, find_candidates
 from fusion_service.centre.copies import Copies
@@ -34,6 +33,7 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.tracks import set_links
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import assign_near
+from fusion_service.records import altered
 from schemas import Entry, messages
 
 __all__ = ["Linker"]
@@ -92,13 +92,14 @@ class Linker:
     def _assign(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> Ints:
         """Exchange links and let loose rows join, source by source; a track that takes part in an exchange of
         one source is left alone by the others until the next step. Returns the rows that joined a track."""
+        if not (len(near.joins.first) or len(near.rivals.first) or self.rivals.by_source):
+            return np.zeros(0, dtype=np.intp)
         sums = self._rival_sums(rows, now, near)
-        weight = self.tests.weight(rows.tracks.data)
         touched = np.zeros(len(now.id), dtype=np.bool_)
         joined: list[Ints] = [np.zeros(0, dtype=np.intp)]
-        active = near.joins.first, near.rivals.first[sums > weight[near.rivals.first]]
+        active = near.joins.first, near.rivals.first[sums > self.tests.weight(rows.tracks.data[near.rivals.first])]
         for name in np.unique(rows.source[np.concatenate(active)]).tolist():
-            row, track, value, stays = self._options(rows, now, near, sums, weight, name, touched)
+            row, track, value, stays = self._options(rows, now, near, sums, name, touched)
             if not len(row):
                 continue
             order = np.lexsort((track, row))
@@ -129,7 +130,7 @@ class Linker:
         return np.clip(MEMORY * before + more, -LOW, MOST_RIVAL)
 
     def _options(
-        self, rows: Rows, now: Picture, near: Candidates, sums: Floats, weight: Floats, name: int, touched: Bools
+        self, rows: Rows, now: Picture, near: Candidates, sums: Floats, name: int, touched: Bools
     ) -> tuple[Ints, Ints, Floats, Bools]:
         """Of one source: the possible pairs (row, track), what each is worth, and which of them are as they stand.
         Only clusters in which something can change."""
@@ -145,18 +146,18 @@ class Linker:
         holders = _holders(rows, now, np.concatenate([joins.second, rivals.second]), name)
         standing = np.unique(np.concatenate([believed, loose[tracks.link[loose] != NO_TRACK], holders]))
         at = now.find(tracks.link[standing])
-        stay = np.where(tracks.outside[standing], 0.5, STANDING + weight[standing])
+        stay = np.where(tracks.outside[standing], 0.5, STANDING + self.tests.weight(tracks.data[standing]))
         row = np.concatenate([joins.first, rivals.first, standing])
         track = np.concatenate([joins.second, rivals.second, at])
         value = np.concatenate([worth, STANDING + sums, stay])
         stays = np.arange(len(row)) >= len(row) - len(standing)
         free = ~touched[track] | stays
-        held = np.isin(row, standing[touched[at]])
+        held = among(row, standing[touched[at]])
         free &= ~held & (value > 0)
         own = tracks.link[row] == now.id[track]
         free &= stays | ~own
         row, track, value, stays = row[free], track[free], value[free], stays[free]
-        reason = np.concatenate([loose, rivals.first[sums > weight[rivals.first]]])
+        reason = np.concatenate([loose, rivals.first[sums > self.tests.weight(tracks.data[rivals.first])]])
         inside = _in_clusters(row, track, reason, len(rows.source), len(now.id))
         return row[inside], track[inside], value[inside], stays[inside]
 
@@ -186,7 +187,7 @@ class Linker:
             chosen = now.id[track] == link
             gained = np.zeros(len(rows.source))
             gained[row[chosen]] = value[chosen]
-            value = np.clip(np.where(np.isin(row, moved), value - gained[row], value), -LOW, MOST_RIVAL)
+            value = np.clip(np.where(among(row, moved), value - gained[row], value), -LOW, MOST_RIVAL)
             row, track, value = row[~chosen], track[~chosen], value[~chosen]
         # rows without a new datum keep what they had
         old_row, old_track, old = self.rivals.known(rows, now)
@@ -202,7 +203,7 @@ class Linker:
         tracks, tests = rows.tracks, self.tests
         if not len(free):
             return np.zeros(0, dtype=np.bool_)
-        joins = near.joins.take(np.isin(near.joins.first, free))
+        joins = near.joins.take(among(near.joins.first, free))
         holds = _held(rows, now, joins.first, joins.second)
         joins = joins.take(holds)
         order = np.lexsort((joins.distance + joins.spread, joins.first))
@@ -303,7 +304,7 @@ class Linker:
 def _vacant(near: Candidates, meeting: Meeting) -> Candidates:
     """Without the pairs whose place another row has by order."""
     joins, rivals = (pairs.take(~meeting.taken(pairs.first, pairs.second)) for pairs in (near.joins, near.rivals))
-    return replace(near, joins=joins, rivals=rivals)
+    return altered(near, joins=joins, rivals=rivals)
 
 
 def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgement) -> Candidates:
@@ -313,7 +314,7 @@ def _without_broken(near: Candidates, rows: Rows, now: Picture, judged: Judgemen
     was = np.zeros(len(rows.source), dtype=np.uint64)
     was[judged.broken] = judged.was
     joins = near.joins.take(was[near.joins.first] != now.id[near.joins.second])
-    return replace(near, joins=joins)
+    return altered(near, joins=joins)
 
 
 def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
@@ -323,14 +324,14 @@ def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
     inside = rows.inside()
     width = max(len(now.id), 1)
     keys = np.unique(rows.source[inside] * width + now.find(rows.tracks.link[inside]))
-    return np.isin(rows.source[row] * width + track, keys)
+    return among(rows.source[row] * width + track, keys)
 
 
 def _holders(rows: Rows, now: Picture, wanted: Ints, name: int) -> Ints:
     """The rows of the source that stand in a track that another row of it may join or exchange its own for."""
     ids = np.unique(now.id[wanted])
     mine = np.flatnonzero((rows.source == name) & (rows.tracks.link != NO_TRACK))
-    return mine[np.isin(rows.tracks.link[mine], ids)]
+    return mine[among(rows.tracks.link[mine], ids)]
 
 
 def _in_clusters(row: Ints, track: Ints, reason: Ints, rows: int, tracks: int) -> Bools:
@@ -339,7 +340,7 @@ def _in_clusters(row: Ints, track: Ints, reason: Ints, rows: int, tracks: int) -
         return np.zeros(0, dtype=np.bool_)
     graph = coo_array((np.ones(len(row), dtype=np.int8), (row, rows + track)), (rows + tracks, rows + tracks))
     part = connected_components(graph, directed=False)[1]
-    return np.isin(part[row], part[reason])
+    return among(part[row], part[reason])
 
 
 def _distance_of(near: Candidates, row: Ints, track: Ints) -> Floats:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Ints
+from fusion_service.arrays import Ints, among
 from fusion_service.centre.constraints import constraints
 from fusion_service.centre.identity import TRUSTED, Terms
 from fusion_service.centre.intake import Intake
@@ -49,7 +49,7 @@ class Meeting:
         self.compartment_of_tracks = labels.compartments.of_tracks(ids, rows, names)
         self.held = self._orders.held
         self._separate = [*self._orders.separate.tolist(), *unmerged.tolist()]
-        there = np.isin(self._orders.forced_track, ids)
+        there = among(self._orders.forced_track, ids)
         self.forced_row, self.forced_track = self._orders.forced_row[there], self._orders.forced_track[there]
 
     def settle(self, step: int, journal: Journal) -> None:
@@ -67,14 +67,16 @@ class Meeting:
         """The rows whose standing links an order forbids, or another row of the track that is trusted to be another
         object. Of two rows that are never to be together the second leaves, unless it is linked by order."""
         linked, link, orders = self._rows.linked(), self._rows.tracks.link, self._orders
+        if not (len(orders.apart_i) or len(orders.forbidden_row)) and (self._rows.tracks.identity == NONE).all():
+            return linked[:0]
         together = (link[orders.apart_i] == link[orders.apart_j]) & (link[orders.apart_i] != NO_TRACK)
         i, j = orders.apart_i[together], orders.apart_j[together]
-        leaves = np.where(np.isin(j, self.forced_row), i, j)
+        leaves = np.where(among(j, self.forced_row), i, j)
         stays = np.setdiff1d(np.concatenate([i, j]), leaves)
-        bad = orders.forbids(linked, link[linked]) & ~np.isin(linked, stays)
+        bad = orders.forbids(linked, link[linked]) & ~among(linked, stays)
         odd = self._identities.contradicted(self._rows, linked, self.forced_row)
-        bad |= np.isin(linked, odd)
-        return linked[bad & ~np.isin(linked, self.forced_row)]
+        bad |= among(linked, odd)
+        return linked[bad & ~among(linked, self.forced_row)]
 
     def with_tracks(self, row: Ints, at: Ints) -> Terms:
         """Of P pairs of a row and a global track (its place in `ids`): the log-likelihood ratio, by what they are said
@@ -107,9 +109,11 @@ class Meeting:
     def taken(self, row: Ints, at: Ints) -> Mask:
         """Of P pairs of a row and a global track (its place in `ids`), those whose place another row of the source has
         by order."""
+        if not len(self.forced_row):
+            return np.zeros(len(row), dtype=np.bool_)
         source, width = self._rows.source, max(len(self._ids), 1)
         keys = source[self.forced_row] * width + np.searchsorted(self._ids, self.forced_track)
-        return np.isin(source[row] * width + at, keys) & ~np.isin(row, self.forced_row)
+        return among(source[row] * width + at, keys) & ~among(row, self.forced_row)
 
     def key_of(self, row: int) -> tuple[str, int, int]:
         """Source, epoch and local id of a row."""
@@ -149,7 +153,7 @@ class Meeting:
         """The global tracks (places in `ids`) that are trusted to be something, by code and then by age; and the
         codes."""
         ids, code = self._identities.trusted_tracks()
-        there = np.isin(ids, self._ids)
+        there = among(ids, self._ids)
         at, code = np.searchsorted(self._ids, ids[there]), code[there]
         order = np.lexsort((at, code))
         return at[order], code[order]

@@ -6,13 +6,12 @@ with one of them alone it stays there; every other one goes by the rule of the c
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, among
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size
 from fusion_service.centre.correlation import AUTO, declared_correlation, declared_motions, sound_rows
@@ -31,6 +30,7 @@ from fusion_service.centre.shared_noise import shared_noise
 from fusion_service.centre.tracklets import Filters, Operations, closed, run
 from fusion_service.centre.versions import Versions, versions_of
 from fusion_service.centre.watch import UNTRUE, WATCHED, Watch
+from fusion_service.records import altered
 from schemas import Entry
 
 __all__ = ["Memory"]
@@ -103,7 +103,7 @@ class Memory:
         fed, count = at >= 0, len(now.id)
         able = np.bincount(at[fed & capable], minlength=count)
         other = np.bincount(at[fed & ~capable], minlength=count)
-        held = np.isin(now.id, self.filters.id)
+        held = among(now.id, self.filters.id)
         begun = (before.time >= 0) & self._config.by_tracklets
         return np.asarray(((able > 1) | (held & (able > 0) & (other == 0))) & begun)
 
@@ -113,7 +113,7 @@ class Memory:
         sources = (self._intake.sources[name] for name in names)
         declared = [self._intake.motion_said(source) for source in sources]
         at = picture.find(rows.tracks.link[inside])
-        return replace(picture, motion=self.motions.follow(picture, at, declared, rows.source[inside]))
+        return altered(picture, motion=self.motions.follow(picture, at, declared, rows.source[inside]))
 
     def _followed(
         self, rows: Rows, names: tuple[str, ...], versions: Versions, ruled: Bools, time: int, journal: Journal
@@ -171,7 +171,7 @@ class Memory:
         whole = filtered[at] & (tracks.time > tracks.used) & (spoiled | ~capable | ~settled)
         self._note(rows, names, row, stays, found, good)
         new = self._as_operations(rows, names, versions, found, np.flatnonzero(good))
-        kept = np.isin(self.filters.pending.track, picture.id[filtered[:-1]])
+        kept = among(self.filters.pending.track, picture.id[filtered[:-1]])
         operations = self.filters.pending.take(kept).join(new, _whole(rows, np.flatnonzero(whole), time))
         some = np.flatnonzero(filtered[:-1])
         which = np.searchsorted(picture.id[some], operations.track)
@@ -192,7 +192,7 @@ class Memory:
             there = picture.find(ids)
             lineage[there] = kinship.inherited(rows, fed[groups], lineage[there], memory=True)
         way = np.where(filtered[:-1], BY_TRACKLETS, picture.way).astype(np.uint8)
-        picture = replace(picture, mean=mean, covariance=covariance, time=when, lineage=lineage, way=way)
+        picture = altered(picture, mean=mean, covariance=covariance, time=when, lineage=lineage, way=way)
         return with_parts(picture, some, [])
 
     def _note(
@@ -238,7 +238,7 @@ class Memory:
     def _keep(self, picture: Picture, bases: States, some: Ints, pending: Operations, ruled: Bools) -> None:
         """The filters of the next step: those that ran, and those that nothing was said of."""
         held = self.filters
-        quiet = np.isin(held.id, picture.id[~ruled]) & ~np.isin(held.id, picture.id[some])
+        quiet = among(held.id, picture.id[~ruled]) & ~among(held.id, picture.id[some])
         ids = np.concatenate([picture.id[some], held.id[quiet]])
         order = np.argsort(ids, kind="stable")
         one, other = bases, held.base.take(quiet)
@@ -248,8 +248,8 @@ class Memory:
             np.concatenate([one.covariance, other.covariance], axis=-1)[..., order],
             np.concatenate([one.motion, other.motion])[order],
         )
-        rest = held.pending.take(np.isin(held.pending.track, held.id[quiet]))
-        pending = replace(pending, row=np.full_like(pending.row, -1))
+        rest = held.pending.take(among(held.pending.track, held.id[quiet]))
+        pending = altered(pending, row=np.full_like(pending.row, -1))
         self.filters = Filters(held.names, ids[order], base, pending.join(rest))
 
     def rebase(self, time: int) -> None:

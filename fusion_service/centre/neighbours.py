@@ -14,6 +14,7 @@ whatever was kept: nothing of this is in a checkpoint.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -37,6 +38,13 @@ MOST_BESIDE = 20
 """Rows in strips, for each row, beyond which all are sought at once."""
 
 Ids = NDArray[np.uint64]
+
+
+@cache
+def _all_pairs(count: int) -> tuple[Ints, Ints]:
+    """Of fewer than `CROWDED`. Not to be written."""
+    i, j = np.triu_indices(count, 1)
+    return i, j
 
 
 class _List(NamedTuple):
@@ -64,7 +72,7 @@ class Neighbours:
         if not (np.isfinite(positions).all() and np.isfinite(sigma).all() and np.isfinite(reach)):
             return candidate_pairs(positions, sigma, reach, source)
         if count < CROWDED:
-            i, j = np.triu_indices(count, 1)
+            i, j = _all_pairs(count)
             near = within(positions, np.maximum(sigma, 1e-9), reach, source, i, j)
             return i[near], j[near]
         r = reach * np.maximum(sigma, 1e-9)

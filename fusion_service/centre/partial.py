@@ -188,9 +188,11 @@ def transformed(
 ) -> tuple[Floats, Floats]:
     """`geodesy.transform` of densities (C, n), (C, n, n): what one does not know is left out, and padded again, so that
     an unknown height spreads over nothing else. Raises `FrameError`."""
+    if frame == target:
+        return means, covariances
     unknown = Unknown.of(space)
     known = unknown.known(covariances.transpose(1, 2, 0))
-    if frame == target or known.all():
+    if known.all():
         return transform(means, covariances, space, frame, target, height)
     out_mean, out_covariance = np.zeros_like(means), np.zeros_like(covariances)
     out_covariance[:, range(len(space)), range(len(space))] = unknown.pad

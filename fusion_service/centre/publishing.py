@@ -18,6 +18,7 @@ from fusion_service.centre.pictures import is_picture_of
 from fusion_service.config import CentreConfig
 from fusion_service.coverage import region_holds
 from fusion_service.densities import Mixtures
+from fusion_service.layout import to_first
 from schemas import ORIGINS, STATUSES, GlobalTracks, Local, messages
 
 __all__ = ["Contributions", "live_on", "picture_message"]
@@ -153,6 +154,6 @@ def _densities(picture: Picture, space: tuple[str, ...], publish: str) -> dict[s
         mean = picture.part_mean[:, heaviest, each]
         covariance = unknown.told(picture.part_covariance[:, :, heaviest, each])
     return {
-        "means": np.ascontiguousarray(mean.T),
-        "covariances": np.ascontiguousarray(np.moveaxis(covariance, 2, 0)),
+        "means": to_first(mean, mean.shape[-1:], 1),
+        "covariances": to_first(covariance, mean.shape[-1:], 2),
     }

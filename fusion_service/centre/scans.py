@@ -27,6 +27,8 @@ MAX_WEIGHT = 1e3
 """Expected number in one component of an intensity."""
 
 Scan: TypeAlias = LocalTracks | LocalIntensity
+Mask: TypeAlias = NDArray[np.bool_] | None
+"""Which tracks of a message; None: all."""
 
 
 def size_of(message: Message) -> int:
@@ -130,49 +132,49 @@ def message_tracks(
             mixtures = reduce_mixtures(mixtures, max_components=most)
         mean, covariance = mixtures.moments()
         parts = mixtures.log_weights, mixtures.means, linalg.symmetrise(mixtures.covariances)
-    counts = [int(rows.sum()) for rows in sound]
     extent = message_extents(messages, sound, mean, frame)
+    some = [None if rows.all() else rows for rows in sound]
+    counts = [len(rows) if part is None else int(part.sum()) for rows, part in zip(sound, some, strict=True)]
     times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
     updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
-    existence = [np.full(len(m.ids), np.nan) if m.existence is None else m.existence for m in messages]
     return Tracks(
-        id=_gather([m.ids for m in messages], sound).astype(np.uint64),
+        id=_gather([m.ids for m in messages], some, np.uint64),
         time=times,
         mean=mean,
         covariance=linalg.symmetrise(covariance),
         log_weight=parts[0],
         part_mean=parts[1],
         part_covariance=parts[2],
-        existence=_gather(existence, sound).astype(np.float64),
-        updated=np.minimum(_gather(updated, sound), times),
+        existence=_optional([m.existence for m in messages], some, counts, np.nan, np.float64),
+        updated=np.minimum(_gather(updated, some, np.int64), times),
         interval=np.zeros(len(times), dtype=np.int64),
-        **_told(messages, sound, said),
-        lineage=_gather([lineages.of_message(m) for m in messages], sound),
+        **_told(messages, some, counts, said),
+        lineage=_gather([lineages.of_message(m) for m in messages], some, np.int32),
         extent=extent,
         **unlinked(len(times)),
     )
 
 
 def _told(
-    messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], said: Lexicon
+    messages: Sequence[LocalTracks], some: Sequence[Mask], counts: Sequence[int], said: Lexicon
 ) -> dict[str, NDArray[Any]]:
     """The columns of what the tracks are said to be, and of their origin."""
-    nothing = [np.full(len(m.ids), -1, dtype=np.int32) for m in messages]
     identity, kind = (
-        [none if texts is None else words.codes(texts) for texts, none in zip(column, nothing, strict=True)]
+        [None if texts is None else words.codes(texts) for texts in column]
         for words, column in ((said.identity, [m.identity for m in messages]), (said.kind, [m.kind for m in messages]))
     )
-    sure = [np.full(len(m.ids), np.nan) if m.kind_p is None else m.kind_p for m in messages]
     own = [getattr(m, "track_origin", None) for m in messages]
-    origins = [
-        np.full(len(m.ids), ORIGINS.index(m.origin), dtype=np.uint8) if column is None else column
-        for m, column in zip(messages, own, strict=True)
-    ]
+    usual = [ORIGINS.index(m.origin) for m in messages]
+    if len({*usual}) > 1:
+        own = [
+            np.full(len(m.ids), code, dtype=np.uint8) if column is None else column
+            for m, code, column in zip(messages, usual, own, strict=True)
+        ]
     return {
-        "identity": _gather(identity, sound),
-        "kind": _gather(kind, sound),
-        "kind_p": _gather(sure, sound).astype(np.float64),
-        "origin": _gather(origins, sound),
+        "identity": _optional(identity, some, counts, -1, np.int32),
+        "kind": _optional(kind, some, counts, -1, np.int32),
+        "kind_p": _optional([m.kind_p for m in messages], some, counts, np.nan, np.float64),
+        "origin": _optional(own, some, counts, usual[0], np.uint8),
     }
 
 
@@ -186,9 +188,23 @@ def _components(message: LocalTracks, sound: NDArray[np.bool_]) -> tuple[Floats,
     return message.means[rows], message.covariances[rows], message.weights[rows], counts[sound]
 
 
-def _gather(columns: Sequence[NDArray[Any]], rows: Sequence[NDArray[np.bool_]]) -> NDArray[Any]:
-    """Always arrays of their own: those of a message may not be written."""
-    return np.concatenate([_some(column, mask) for column, mask in zip(columns, rows, strict=True)])
+def _optional(
+    columns: Sequence[NDArray[Any] | None], some: Sequence[Mask], counts: Sequence[int], usual: float, kind: Any
+) -> NDArray[Any]:
+    """The column of what messages may leave out: there as usual."""
+    if all(column is None for column in columns):
+        return np.full(sum(counts), usual, dtype=kind)
+    parts = [
+        np.full(count, usual, dtype=kind) if column is None else column if mask is None else column[mask]
+        for column, mask, count in zip(columns, some, counts, strict=True)
+    ]
+    return np.concatenate(parts).astype(kind, copy=False)
+
+
+def _gather(columns: Sequence[NDArray[Any]], some: Sequence[Mask], kind: Any) -> NDArray[Any]:
+    """Always an array of its own: those of a message may not be written."""
+    parts = [column if mask is None else column[mask] for column, mask in zip(columns, some, strict=True)]
+    return np.concatenate(parts).astype(kind, copy=False)
 
 
 def _some(column: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:

@@ -5,15 +5,18 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import among
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
 from fusion_service.centre.places import Place, followed
 from fusion_service.centre.tracks import Pair, Tracks, by_id, empty_tracks, join_tracks, renewed
+from fusion_service.config import SourceConfig
+from fusion_service.records import altered
 from schemas import LocalTracks, SensorInfo
 
 __all__ = ["REMEMBERED", "Source"]
@@ -32,7 +35,8 @@ class Source:
     lag: how far behind the last step its messages come, ns, about the longest of late. places: of its newest messages
     that say one. Of the step being made: came, the time of each message with tracks, and when it came, ns; arrived, the
     ids that came; dropped, the links of tracks that complete scans list no more; pairs, the versions of what came,
-    where those are followed; ahead, the time of the newest message that is for a later one.
+    where those are followed; ahead, the time of the newest message that is for a later one. declared: its info, and
+    what holds for it by that and the config.
     """
 
     name: str
@@ -68,6 +72,7 @@ class Source:
     first: dict[str, int] = field(default_factory=dict)
     seen: deque[tuple[str, int, int]] = field(default_factory=deque)
     seen_set: set[tuple[str, int, int]] = field(default_factory=set)
+    declared: tuple[SensorInfo | None, SourceConfig] | None = None
 
     def begin(self, epoch: int) -> None:
         """Forget the last run: tracks, links, sequence."""
@@ -123,12 +128,12 @@ class Source:
         space, complete, end = messages[-1].space, messages[-1].complete, messages[-1].time
         new = by_id(new.take(new.time >= self.complete))
         old = self.tracks if space == self.space else empty_tracks(len(space))
-        new = replace(new, interval=intervals(new.id, new.time, self._known(old), pace))
+        new = altered(new, interval=intervals(new.id, new.time, self._known(old), pace))
         merged, stays, pair = renewed(old, new, versions)
         gone = old.link[:0]
         if complete and end >= self.complete and stays.any():
             listed = ~stays | (old.time > end)
-            listed[~listed] = np.isin(old.id[~listed], messages[-1].ids)
+            listed[~listed] = among(old.id[~listed], messages[-1].ids)
             stays, gone = stays & listed, old.link[~listed]
         if stays.any():
             merged = join_tracks([old.take(stays), merged])

@@ -36,7 +36,9 @@ def stated_registration(intake: Intake, names: tuple[str, ...]) -> Floats | None
 
 def shift_of(intake: Intake, source: Source) -> Floats | None:
     """Covariance (n, n), m2, in the picture's space and frame, of the shift that a source states; None if none."""
-    frame, space = intake.frame, intake.config.space
+    frame, space, said = intake.frame, intake.config.space, intake.declared(source)
+    if not said.registration_sigma and (said.override or _stated(source) is None):
+        return None
     shift = np.zeros((3, 3)) if frame is None else _shift(intake, source, frame)
     if not shift.any():
         return None

@@ -13,16 +13,17 @@ with the operations since, and in each step runs through these again.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, from_bytes, to_bytes
+from fusion_service.arrays import Bools, Floats, Ints, among, from_bytes, to_bytes
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.motions import Motions, States
+from fusion_service.records import altered, columns_of
 from fusion_service.rules import fuse_last
 
 __all__ = ["Filters", "Operations", "closed", "run"]
@@ -57,7 +58,7 @@ class Operations:
 
     def take(self, at: Any) -> Operations:
         """The given ones (indices or a mask)."""
-        return Operations(*(getattr(self, one.name)[..., at] for one in fields(self)))
+        return Operations(*(column[..., at] for column in columns_of(self)))
 
     def join(self, *others: Operations) -> Operations:
         """All of them, in order."""
@@ -95,13 +96,13 @@ class Filters:
             new = np.array([where.get(name, -1) for name in self.names] or [-1], dtype=np.int64)
             if len(self.pending.source):
                 source = new[self.pending.source]
-                self.pending = replace(self.pending, source=source).take(source >= 0)
+                self.pending = altered(self.pending, source=source).take(source >= 0)
             self.names = names
 
     def bases(self, before: Picture) -> States:
         """The states that the picture's filters go on from; `before`: the picture as it was after the last step."""
         base = States.of(before.time.copy(), before.mean.copy(), before.covariance.copy(), before.motion)
-        known = np.isin(before.id, self.id)
+        known = among(before.id, self.id)
         at = np.searchsorted(self.id, before.id[known])
         base.time[known] = self.base.time[at]
         base.mean[:, known], base.covariance[:, :, known] = self.base.mean[:, at], self.base.covariance[:, :, at]
@@ -182,7 +183,7 @@ def _put(into: States, at: Ints, states: States) -> None:
 
 def _at(states: States, time: NDArray[np.int64], motions: Motions) -> States:
     """The states predicted to times that are not before theirs."""
-    return replace(motions.moved(states, states.motion, np.maximum(time - states.time, 0) / 1e9), time=time)
+    return altered(motions.moved(states, states.motion, np.maximum(time - states.time, 0) / 1e9), time=time)
 
 
 def _updated(
@@ -223,7 +224,7 @@ def _updated(
         some, which = some[whole], which[whole]
         if len(some):
             _intersect(mean, covariance, some, which, operations, share)
-    return replace(states, mean=mean, covariance=covariance)
+    return altered(states, mean=mean, covariance=covariance)
 
 
 def _beside(covariance: Floats, matrix: Floats, innovation: Floats) -> Floats:

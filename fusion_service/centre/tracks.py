@@ -7,15 +7,16 @@ restarted client takes over nobody's links.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints, picked
+from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.words import Codes
 from fusion_service.densities import Mixtures
+from fusion_service.records import altered, columns_of
 
 __all__ = [
     "EXTENT_ROWS",
@@ -163,11 +164,27 @@ def empty_tracks(n: int) -> Tracks:
 
 def unlinked(count: int) -> dict[str, NDArray[Any]]:
     """The columns `LINKS` of tracks that nothing is known of."""
-    return {name: np.full(count, blank, dtype=kind) for name, (kind, blank) in _BLANK.items()}
+    whole, real, ids = np.full((6, count), -1), np.zeros((2, count)), np.zeros((2, count), dtype=np.uint64)
+    return {
+        "link": ids[0],
+        "since": whole[0],
+        "used": whole[1],
+        "judged": whole[2],
+        "weighed": whole[3],
+        "seen": whole[4],
+        "data": np.zeros(count, dtype=np.int64),
+        "evidence": real[0],
+        "outside": np.zeros(count, dtype=np.bool_),
+        "shadow": ids[1],
+        "apart": real[1],
+        "told": whole[5],
+    }
 
 
 def set_links(tracks: Tracks, at: NDArray[np.intp], link: NDArray[np.uint64] | np.uint64, step: int) -> None:
     """Give the tracks `at` a link in `step`, 0 for none, with nothing known of it yet. Writes the columns `LINKS`."""
+    if not len(at):
+        return
     for name, (_, blank) in _BLANK.items():
         if name not in OF_THE_TRACK:
             getattr(tracks, name)[at] = blank
@@ -176,7 +193,7 @@ def set_links(tracks: Tracks, at: NDArray[np.intp], link: NDArray[np.uint64] | n
 
 def relinked(tracks: Tracks, at: NDArray[np.intp], link: NDArray[np.uint64] | np.uint64, step: int) -> Tracks:
     """The same with other links, as `set_links` gives them."""
-    new = replace(tracks, **{name: getattr(tracks, name).copy() for name in LINKS})
+    new = altered(tracks, **{name: getattr(tracks, name).copy() for name in LINKS})
     set_links(new, at, link, step)
     return new
 
@@ -194,8 +211,7 @@ def join_tracks(parts: Sequence[Columns]) -> Columns:
     first = parts[0]
     if len({len(getattr(part, "extent", ())) for part in parts}) > 1:
         parts = [_with_extents(part) for part in parts]
-    names = [one.name for one in fields(first)]
-    return type(first)(*(np.concatenate([getattr(part, name) for part in parts], axis=-1) for name in names))
+    return type(first)(*(np.concatenate(column, axis=-1) for column in zip(*map(columns_of, parts), strict=True)))
 
 
 def _with_extents(tracks: Columns) -> Columns:
@@ -204,7 +220,7 @@ def _with_extents(tracks: Columns) -> Columns:
     if len(extent):
         return tracks
     rows = EXTENT_ROWS if isinstance(tracks, Tracks) else FUSED_ROWS
-    return replace(tracks, extent=np.full((rows, extent.shape[-1]), np.nan))
+    return altered(tracks, extent=np.full((rows, extent.shape[-1]), np.nan))
 
 
 def as_mixtures(tracks: HasParts, rows: Any) -> Mixtures:
@@ -229,18 +245,19 @@ def padded(tracks: Columns, components: int) -> Columns:
         log_weight[0] = 0.0
         mean = np.repeat(tracks.mean[:, None], components, axis=1)
         covariance = np.repeat(tracks.covariance[:, :, None], components, axis=2)
-    return replace(tracks, log_weight=log_weight, part_mean=mean, part_covariance=covariance)
+    return altered(tracks, log_weight=log_weight, part_mean=mean, part_covariance=covariance)
 
 
 def taken(columns: Any, rows: Any) -> Any:
     """Columns, (..., T) each, of the given rows (indices or a mask): the same ones where a mask holds for all."""
-    names = [one.name for one in fields(columns)]
-    if not isinstance(rows, np.ndarray) or rows.dtype != np.bool_:
-        return type(columns)(*(picked(getattr(columns, name), rows) for name in names))
+    if not isinstance(rows, np.ndarray):
+        return type(columns)(*(column[..., rows] for column in columns_of(columns)))
+    if rows.dtype != np.bool_:
+        return type(columns)(*(column.take(rows, axis=-1) for column in columns_of(columns)))
     if rows.all():
         return columns
     at = np.flatnonzero(rows)
-    return type(columns)(*(getattr(columns, name).take(at, axis=-1, mode="clip") for name in names))
+    return type(columns)(*(column.take(at, axis=-1, mode="clip") for column in columns_of(columns)))
 
 
 def by_id(tracks: Tracks) -> Tracks:
@@ -265,6 +282,8 @@ def renewed(old: Tracks, new: Tracks, versions: bool = False) -> Step:
     """The step from a table, sorted by id, to what a report says, `new` (as `by_id`; it may hold an id several times):
     of each id the newest counts, the later given where times are equal. Links are kept unless the origin has changed.
     versions: give the pairs too."""
+    if len(old.id) == len(new.id) > 0 and (old.id == new.id).all() and (old.time <= new.time).all():
+        return _renewed_all(old, new, versions)
     last = np.append(new.id[1:] != new.id[:-1], np.ones(min(len(new.id), 1), dtype=np.bool_))
     pair = successive(old, new) if versions and not last.all() else None
     single, new = last.all(), new.take(last)
@@ -286,7 +305,19 @@ def renewed(old: Tracks, new: Tracks, versions: bool = False) -> Step:
         kept = {name: getattr(was, name) for name in LINKS}
     else:
         kept = {name: np.where(same, getattr(was, name), getattr(new, name)) for name in LINKS}
-    return Step(_alike(old, replace(new, **kept)), stays, pair)
+    return Step(_alike(old, altered(new, **kept)), stays, pair)
+
+
+def _renewed_all(old: Tracks, new: Tracks, versions: bool) -> Step:
+    """`renewed` of a table by a report that names each of its tracks once, and no older: what nearly every one does."""
+    same, pair = old.origin == new.origin, None
+    if versions:
+        later = same & (new.updated > old.updated)
+        pair = (old.take(later), new.take(later)) if later.any() else None
+    kept = {name: getattr(old, name) for name in LINKS}
+    if not same.all():
+        kept = {name: np.where(same, column, getattr(new, name)) for name, column in kept.items()}
+    return Step(_alike(old, altered(new, **kept)), np.zeros(len(old.id), dtype=np.bool_), pair)
 
 
 def _places(ids: NDArray[np.uint64], some: NDArray[np.uint64]) -> tuple[Ints, Bools]:

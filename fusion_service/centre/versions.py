@@ -8,8 +8,9 @@ nothing else. A version in which there is no newer measurement, or that comes af
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from itertools import groupby
+from operator import attrgetter
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -21,6 +22,7 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.tracks import Tracks, join_tracks, taken
 from fusion_service.centre.treatment import Treatment
+from fusion_service.records import altered, columns_of, names_of
 from schemas import Motion
 
 __all__ = ["Versions", "versions_of"]
@@ -127,7 +129,7 @@ def _registered(versions: Versions, treatment: Treatment, latest: int) -> Versio
     new ones; what remains uncertain of it is not added, since it is no error of a measurement (see `watch`)."""
     if treatment.clock:
         when, before = (np.minimum(at - treatment.clock, latest) for at in (versions.time, versions.before))
-        versions = replace(versions, time=when, before=before)
+        versions = altered(versions, time=when, before=before)
     if treatment.correction is None:
         return versions
     old = treatment.correction.moved(versions.predicted_mean, versions.predicted_covariance)
@@ -152,9 +154,12 @@ class _Densities:
         return cast(_Densities, taken(self, at))
 
 
+_DENSITIES = attrgetter(*names_of(_Densities))
+
+
 def _densities(parts: list[Tracks]) -> _Densities:
     """One after the other."""
-    return _together([_Densities(*(getattr(part, one.name) for one in fields(_Densities))) for part in parts])
+    return _together([_Densities(*_DENSITIES(part)) for part in parts])
 
 
 def _together(parts: list[_Densities]) -> _Densities:
@@ -162,7 +167,7 @@ def _together(parts: list[_Densities]) -> _Densities:
 
 
 def _joined(parts: list[Versions]) -> Versions:
-    return Versions(*(np.concatenate([getattr(part, one.name) for part in parts], axis=-1) for one in fields(Versions)))
+    return Versions(*(np.concatenate(column, axis=-1) for column in zip(*map(columns_of, parts), strict=True)))
 
 
 def _thinned(old: _Densities, new: _Densities, at: Any) -> tuple[_Densities, _Densities, Any]:
@@ -183,4 +188,4 @@ def _as_said(tracks: _Densities, inflation: float) -> _Densities:
     """Covariances before they were inflated."""
     if inflation == 1.0:
         return tracks
-    return replace(tracks, covariance=tracks.covariance / inflation, part_covariance=tracks.part_covariance / inflation)
+    return altered(tracks, covariance=tracks.covariance / inflation, part_covariance=tracks.part_covariance / inflation)
