@@ -1,11 +1,11 @@
 """Tracks of many targets by several sources, with unequal covariances, as messages: the load of `benchmarks.centre` and
 `benchmarks.service`.
 
-Targets lie on a grid of cells of `spacing` m, a place at random in each, and fly straight. Of S sources with about T
-tracks each, the targets are as many as let `overlap` sources see each, S T / overlap: a target is seen by that many
-sources in a row, the first of which goes from target to target in turn. A track has the number of its target for an
-id. Every track says a covariance of its own (sigmas of .5 to 2 times the source's, turned by any angle), and its
-error is drawn from that anew for every scan.
+Targets lie on a grid of cells of `spacing` m, a place at random in each, and fly straight, all nearly alike, so that
+none meets another in half an hour. Of S sources with about T tracks each, the targets are as many as let `overlap`
+sources see each, S T / overlap: a target is seen by that many sources in a row, the first of which goes from target to
+target in turn. A track has the number of its target for an id. Every track says a covariance of its own (sigmas of .5
+to 2 times the source's, turned by any angle), and its error is drawn from that anew for every scan.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class World:
         side = int(np.ceil(np.sqrt(count)))
         cell = np.stack(np.divmod(np.arange(count), side)) - 0.5 * side
         self._place = ((cell + rng.uniform(0.3, 0.7, (2, count))) * load.spacing).T
-        self._velocity = rng.normal(0.0, 20.0, (count, 2))
+        self._velocity = np.array([20.0, 10.0]) + rng.normal(0.0, 0.3, (count, 2))
         first = np.arange(count) % load.sources
         self._whose = [np.flatnonzero((number - first) % load.sources < load.overlap) for number in range(load.sources)]
         self._covariances = [self._drawn(len(whose), rng) for whose in self._whose]
