@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 import schemas
-from benchmarks.load import FRAME, SPACE, Load
+from benchmarks.load import FRAME, SPACE, Load, floor
 from benchmarks.service import setting
 from fusion_service.centre import FusionCentre
 from fusion_service.centre import centre as centre_module
@@ -32,7 +32,6 @@ from fusion_service.centre.memory import Memory
 from fusion_service.centre.motions import Motions
 from fusion_service.centre.supervision import Supervisor
 from fusion_service.compiled import use
-from fusion_service.rules import fuse_last
 
 SECOND = 10**9
 SIGMA = np.array([30.0, 30.0, 2.0, 2.0])
@@ -44,15 +43,6 @@ WAYS: dict[str, dict[str, Any]] = {
     "bar-shalom-campo, derived": {"rule": "bar-shalom-campo", "rule_options": {"cross": "derived"}},
     "bci, derived": {"rule": "bci", "rule_options": {"max_correlation": "derived"}},
 }
-
-
-def best(call: Callable[[], object], repeat: int = 5) -> float:
-    times = []
-    for _ in range(repeat):
-        begin = time.process_time()
-        call()
-        times.append(time.process_time() - begin)
-    return min(times)
 
 
 PARTS: dict[str, tuple[Any, str]] = {
@@ -89,21 +79,6 @@ def parts(times: dict[str, float]) -> Iterator[None]:
     finally:
         for name, (owner, attribute) in PARTS.items():
             setattr(owner, attribute, before[name])
-
-
-def floor(data: list[bytes], overlap: int) -> float:
-    """CPU seconds to unpack a scan of every source, fuse as many tracks in one batch by `naive`, and pack a scan."""
-
-    def once() -> None:
-        messages = [one for one in map(schemas.decode, data) if isinstance(one, schemas.LocalTracks)]
-        few = min(len(one.ids) for one in messages)
-        means = np.ascontiguousarray(np.stack([one.means[:few].T for one in messages[:overlap]]))
-        spreads = [np.moveaxis(one.covariances[:few], 0, -1) for one in messages[:overlap]]
-        for _ in range(max(len(data) // overlap, 1)):
-            fuse_last("naive", means, np.ascontiguousarray(np.stack(spreads)))
-        schemas.encode(messages[0])
-
-    return best(once)
 
 
 def run(load: Load, settings: dict[str, Any], count: int = 14, warm: int = 5) -> str:

@@ -10,14 +10,16 @@ to 2 times the source's, turned by any angle), and its error is drawn from that 
 
 from __future__ import annotations
 
+import time as clock
 from dataclasses import dataclass
 
 import numpy as np
 
 import schemas
 from fusion_service.arrays import Floats
+from fusion_service.rules import fuse_last
 
-__all__ = ["FRAME", "SPACE", "Load"]
+__all__ = ["FRAME", "SPACE", "Load", "floor", "scans"]
 
 SPACE = ("x", "y", "vx", "vy")
 FRAME = schemas.Enu(59.0, -55.0)
@@ -95,3 +97,27 @@ class World:
             means=self.truth(time - start)[self._whose[source]] + self._errors[scan % KEPT][source],
             covariances=self._covariances[source],
         )  # fmt: skip
+
+
+def scans(load: Load) -> list[bytes]:
+    """The first scan of every source, as it is sent."""
+    world = load.world()
+    return [schemas.encode(world.message(source, 0)) for source in range(load.sources)]
+
+
+def floor(data: list[bytes], overlap: int, repeat: int = 5) -> float:
+    """CPU seconds to unpack a scan of every source, fuse as many tracks in batches by `naive`, and pack a scan: the
+    least of `repeat` times."""
+
+    def once() -> float:
+        begin = clock.process_time()
+        messages = [one for one in map(schemas.decode, data) if isinstance(one, schemas.LocalTracks)]
+        few = min(len(one.ids) for one in messages)
+        means = np.ascontiguousarray(np.stack([one.means[:few].T for one in messages[:overlap]]))
+        spreads = [np.moveaxis(one.covariances[:few], 0, -1) for one in messages[:overlap]]
+        for _ in range(max(len(data) // overlap, 1)):
+            fuse_last("naive", means, np.ascontiguousarray(np.stack(spreads)))
+        schemas.encode(messages[0])
+        return clock.process_time() - begin
+
+    return min(once() for _ in range(repeat))

@@ -32,13 +32,12 @@ from typing import Any
 import numpy as np
 
 import schemas
-from benchmarks.load import FRAME, SPACE, Load
+from benchmarks.load import FRAME, SPACE, Load, floor, scans
 from benchmarks.sink import Sink
 from fusion_service.bus import open_bus
 from fusion_service.bus.hub import run_hub
 from fusion_service.config import load_config
 from fusion_service.demo.crew import free_endpoint
-from fusion_service.rules import fuse_last
 from fusion_service.service.daemon import run_service
 
 __all__ = ["Burst", "Report", "Way", "measure", "setting"]
@@ -184,23 +183,6 @@ def _resident(pid: int) -> float:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 2**20
 
 
-def floor(load: Load, scans: int = 5) -> float:
-    """ms of CPU to unpack the scans of all sources, fuse as many in one batch by `naive`, and pack what comes of it."""
-    world = load.world()
-    data = [schemas.encode(world.message(s, 0)) for s in range(load.sources)]
-    times = []
-    for _ in range(scans):
-        begin = time.process_time()
-        messages = [schemas.decode(one) for one in data]
-        few = min(len(m.ids) for m in messages)  # type: ignore[union-attr]
-        means = np.ascontiguousarray(np.stack([m.means[:few].T for m in messages[: load.overlap]]))  # type: ignore[union-attr]
-        spreads = [np.moveaxis(m.covariances[:few], 0, -1) for m in messages[: load.overlap]]  # type: ignore[union-attr]
-        fuse_last("naive", means, np.ascontiguousarray(np.stack(spreads)))
-        schemas.encode(messages[0])
-        times.append(time.process_time() - begin)
-    return 1e3 * float(np.median(times)) * load.targets / few
-
-
 @contextmanager
 def _running(context: Any, target: Any, *arguments: Any) -> Iterator[Any]:
     stop = context.Event()
@@ -218,7 +200,7 @@ def _running(context: Any, target: Any, *arguments: Any) -> Iterator[Any]:
 
 def measure(way: Way) -> Report:
     """Run it."""
-    report = Report(floor=floor(way.load))
+    report = Report(floor=1e3 * floor(scans(way.load), way.load.overlap))
     context = multiprocessing.get_context("spawn")
     endpoint, sink = free_endpoint(), Sink(way.load, way.seconds, WARM)
     begin: multiprocessing.Queue[Any] = context.Queue()
