@@ -94,10 +94,12 @@ class Way:
 
 @dataclass(slots=True)
 class Report:
-    """What came out; times in ms."""
+    """What came out; times in ms. scans: sent from the first to the last, and heard, those that a step took."""
 
     offered: float = 0.0
     taken: float = 0.0
+    scans: int = 0
+    heard: int = 0
     latency: dict[str, float] = field(default_factory=dict)
     pictures: int = 0
     skipped: float = 0.0
@@ -266,6 +268,7 @@ def _evaluated(report: Report, way: Way, start: int, notes: list[tuple[str, int,
         marks = np.percentile(waits, (50, 90, 99, 100)).tolist()
         report.latency = dict(zip(("p50", "p90", "p99", "max"), marks, strict=True))
     report.lost = dict(sink.lost)
+    report.scans, report.heard = len(notes), len({(source, seq) for _, source, seq in sink.taken} & set(when))
     report.bytes_in = sum(offered) / span / 1e6
     out = [(size, count) for at, size, count in sink.sizes if at >= begin]
     report.bytes_out = sum(size for size, _ in out) / span / 1e6
