@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.bus.inbox import Inbox
+from fusion_service.bus.security import Security, SecurityError, read_security
 
 if TYPE_CHECKING:
     from fusion_service.bus.session import Bus, BusError, BusStopped, Publisher, open_bus
@@ -15,8 +16,11 @@ __all__ = [
     "BusStopped",
     "Inbox",
     "Publisher",
+    "Security",
+    "SecurityError",
     "check_endpoint",
     "open_bus",
+    "read_security",
 ]
 
 
