@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from fusion_service.bus.refusal import own_certificate
 from fusion_service.bus.roles import ANYONE, HELLO, allowed, hello_key
 from fusion_service.bus.security import HUB, Security, SecurityError, secured
-from fusion_service.bus.session import DEFAULT_ENDPOINT, open_bus
+from fusion_service.bus.session import DEFAULT_ENDPOINT, open_bus, tell_refusals
 
 __all__ = ["open_hub", "run_hub"]
 
@@ -45,6 +45,7 @@ def open_hub(listen: Sequence[str], security: Security | None = None) -> Iterato
     if security is not None:
         own_certificate(security)
         listen = secured(listen)
+        tell_refusals()
     with open_bus(listen=listen, mode="router", security=security) as bus:
         if security is None:
             log.warning("the hub lets anybody in, as anybody: `fusion-service keys` makes certificates for --security")

@@ -34,6 +34,7 @@ FIRST, REMIND = 2.0, 30.0
 """Seconds until it is told that the hub is waited for, and between that and the next time."""
 LOOK = 5.0
 """Seconds between two looks at why a hub refuses us."""
+HELLOS = 5
 HELLO_PATIENCE = 1.0
 """Seconds that a hub has to say what we may do."""
 
@@ -150,7 +151,8 @@ class _Attempts:
         except BusError as error:
             self.why = f"the hub at {', '.join(self._connect)} {error}"
             session.close()
-            self._abandoned.wait(FIRST)
+            if self._again:
+                self._abandoned.wait(FIRST)
             return None
 
     def _ask_why(self) -> str:
@@ -176,14 +178,15 @@ class _Attempts:
 def _rights(session: Any, common: str) -> Mapping[str, Sequence[str]] | None:
     """What the hub says that we may do; None where it is one that says nothing. Raises `BusError` if it does not know
     us."""
-    for key in (hello_key(common), ANYONE):
-        for reply in session.get(key, timeout=HELLO_PATIENCE):
-            if not reply.ok:
-                continue
-            if key == ANYONE:
-                raise BusError(f"lets {common} say and hear nothing: it is not in its file, under [security] roles")
-            rights: Mapping[str, Sequence[str]] = json.loads(bytes(reply.ok.payload))
-            return rights
+    for again in (*[True] * HELLOS, False):  # a hub that has just begun to listen may not answer yet
+        for key in (hello_key(common), ANYONE):
+            for reply in session.get(key, timeout=HELLO_PATIENCE):
+                if reply.ok and key != ANYONE:
+                    rights: Mapping[str, Sequence[str]] = json.loads(bytes(reply.ok.payload))
+                    return rights
+                if reply.ok and not again:
+                    raise BusError(f"lets {common} say and hear nothing: it is not in its file, under [security] roles")
+        time.sleep(RETRY if again else 0.0)
     log.warning("the hub does not say what %s may do: what is forbidden there gets lost without a word", common)
     return None
 

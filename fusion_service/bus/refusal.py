@@ -24,7 +24,7 @@ SOON = 30.0
 log = logging.getLogger(__name__)
 _ADDRESS = re.compile(r"(\w+)/(?:\[([^\]]+)\]|([^\s:/?#]+)):(\d+)")
 _EXPIRED, _NOT_YET, _PURPOSE, _NAMES = (10,), (9,), (26,), (62, 64)
-_FOREIGN = (2, 7, 18, 19, 20, 21, 24)
+_FOREIGN = (2, 7, 18, 19, 20, 21, 24, 79)
 
 
 class Own(NamedTuple):
@@ -136,7 +136,7 @@ def _alert(error: OSError, other: str) -> str:
     """What the other end says of our certificate; `other` where it says nothing of it."""
     said = str(getattr(error, "reason", "") or "").lower()
     for word, meaning in {
-        "certificate_expired": "refuses our certificate: it has expired",
+        "certificate_expired": "refuses our certificate: it has expired, or does not hold yet (is a clock wrong?)",
         "unknown_ca": "refuses our certificate: it is foreign, another authority has signed it",
         "decrypt_error": "refuses our certificate: its authority has not signed it, or the key is another's",
         "certificate_required": "asks for a certificate, and was shown none",

@@ -124,7 +124,7 @@ def hub_security(path: str | Path | None) -> Security | None:
 def check_party(security: Security, roles: tuple[str, ...], name: str = "") -> None:
     """Raises `SecurityError` if a certificate is not for one of these roles, or for another name."""
     if security.role not in roles:
-        raise SecurityError(f"{security.path}: it is that of {security}: needed is that of a {' or '.join(roles)}")
+        raise SecurityError(f"{security.path}: it is that of {security}, and no good for a {' or a '.join(roles)}")
     if name and security.name != name:
         raise SecurityError(f"{security.path}: it is that of {security}, and no good for {name}")
 
@@ -144,7 +144,7 @@ def _read(path: Path, table: dict[str, Any]) -> Security:
             raise ValueError(f"{name}: {file} cannot be read: is it there, and yours?")
     check_private(files["key"])
     parties = {party.common_name: party for party in _parties(table.get("roles", {}))} if role == HUB else {}
-    hub = here / _text(table, "hub") if "hub" in table else None
+    hub = Path(os.path.normpath(here / _text(table, "hub"))) if "hub" in table else None
     realm = check_realm(_text(table, "realm")) if "realm" in table else REALM
     return Security(path, role, check_name(text["name"]), **files, realm=realm, hub=hub, parties=parties)
 

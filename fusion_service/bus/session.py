@@ -12,7 +12,9 @@ up every other subscription of its session. `Inbox.put` is what they should call
 
 from __future__ import annotations
 
+import functools
 import logging
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -38,6 +40,7 @@ __all__ = [
     "Inbox",
     "Publisher",
     "open_bus",
+    "tell_refusals",
 ]
 
 HEARTBEAT = 0.5
@@ -274,6 +277,13 @@ class Bus:
                     log.warning("cannot take back a declaration: %s", reason(error))
         finally:
             self._session.close()
+
+
+@functools.cache
+def tell_refusals() -> None:
+    """Let Zenoh say on stdout which links it refuses, and why (at most ten lines a second: it waits between them)."""
+    os.environ.setdefault("NO_COLOR", "1")
+    zenoh.init_log_from_env_or("zenoh_link_tls=warn")
 
 
 @contextmanager
