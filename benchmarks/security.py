@@ -1,9 +1,10 @@
 """What certificates and access control cost: `python -m benchmarks.security`.
 
-Two hubs, each a process: an open one by TCP, one by TLS with certificates of both ends and the rules of the roles for 20
-sources. A radar's messages go from a process of its own through a hub to a session that takes them from an `Inbox`, in
-turns by either hub within one run. Latency: from before `put` to `take`, at 1 kHz. Load: messages that come in a second,
-of those offered, and CPU of the receiving process per message. A ratio is the median of the rounds' own ratios.
+Two hubs, each a process: an open one by TCP, one by TLS with certificates of both ends and the rules of the roles for
+20 sources. A radar's messages go from a process of its own through a hub to a session that takes them from an `Inbox`,
+in turns by either hub within one run. Latency: from before `put` to `take`, at 1 kHz. Load: messages that come in a
+second, of those offered, and CPU of the receiving process per message. Line: from before a radar's `tracks`, 20 of them
+at 20 Hz, to the picture of a centre that steps on arrival, at a display. A ratio is the median of the rounds' own.
 
 `--rounds N` (5), `--seconds S` of each measurement (1).
 """
@@ -29,7 +30,12 @@ from numpy.typing import NDArray
 from fusion_service.bus import Inbox, Security, open_bus, read_security
 from fusion_service.bus.hub import run_hub
 from fusion_service.bus.keyring import Keyring
+from fusion_service.config import BusConfig, ServiceConfig, centre_config
+from fusion_service.service.daemon import run_service
+from schemas import Enu, GlobalTracks, Motion, decode, global_key
+from sensor_clients.publisher import TrackPublisher
 
+PARTIES = (("recorder", "rec"), ("centre", "main"), ("viewer", "wall"))
 KEY = "fusion/v1/local/radar-1/tracks"
 
 
@@ -104,6 +110,47 @@ def measure(world: World, size: int, rate: int, seconds: float) -> Result:
     return Result((np.array(received) - np.array(sent)) / 1e6, len(received) / seconds, 1e6 * cost / len(received))
 
 
+def centre(world: World, stop: multiprocessing.synchronize.Event) -> None:
+    config = centre_config({"name": "main", "trigger": "arrival", "arrival_spacing": 0.0, "period": 1.0})
+    security = None if world.keys is None else str(world.keys / "centre-main")
+    bus = BusConfig(connect=(world.endpoint,), security=security)
+    run_service(ServiceConfig(centre=config, bus=bus), stop)  # type: ignore[arg-type]
+
+
+def line(world: World, seconds: float) -> Result:
+    """From a radar's scan to the picture that has it, at a display; `rate`: pictures a second."""
+    sent: dict[int, int] = {}
+    took: list[float] = []
+    site = Enu(lat=59.0, lon=10.0)
+
+    def shown(key: str, data: bytes) -> None:
+        now = time.monotonic_ns()
+        picture = decode(data)
+        if isinstance(picture, GlobalTracks) and picture.time in sent:
+            took.append((now - sent.pop(picture.time)) / 1e6)
+
+    keys = None if world.keys is None else world.keys / "source-radar-1"
+    with (
+        open_bus([world.endpoint], security=world.party("viewer-wall")) as bus,
+        TrackPublisher("radar-1", connect=world.endpoint, security=keys) as radar,
+    ):
+        bus.subscribe(global_key("main", "tracks"), shown, history=0)
+        radar.info(frame=site, position=(0, 0, 0), period=0.05, motion=Motion("cv", 1.0))
+        means = np.arange(20.0)[:, None] * [1000.0, 0.0, 0.0, 0.0] + [0.0, 500.0, 5.0, 0.0]
+        covariances = np.tile(np.diag([25.0, 25.0, 1.0, 1.0]), (20, 1, 1))
+        for number in range(round(20 * (seconds + 0.5))):
+            if number == 10:  # the first ones are the beginning of all
+                took.clear()
+            at = time.time_ns()
+            sent[at] = time.monotonic_ns()
+            radar.tracks(
+                time=at, space=("x", "y", "vx", "vy"), frame=site, ids=range(20), means=means, covariances=covariances
+            )
+            time.sleep(0.05)
+        time.sleep(0.3)
+    return Result(np.array(took), len(took) / seconds, 0.0)
+
+
 def compare(
     worlds: tuple[World, World],
     size: int,
@@ -112,7 +159,10 @@ def compare(
     how: argparse.Namespace,
 ) -> None:
     """Print the median of each figure, plain and secured taken in turns, and that of their ratios."""
-    rounds = [[measure(world, size, rate, how.seconds) for world in worlds] for _ in range(how.rounds)]
+    rounds = [
+        [measure(world, size, rate, how.seconds) if size else line(world, 2 * how.seconds) for world in worlds]
+        for _ in range(how.rounds)
+    ]
     for name, figure in figures.items():
         pairs = [(figure(plain), figure(secured)) for plain, secured in rounds]
         plain, secured = (statistics.median(column) for column in zip(*pairs, strict=True))
@@ -128,10 +178,10 @@ def main() -> None:
     spawn = multiprocessing.get_context("spawn")
     with tempfile.TemporaryDirectory() as folder:
         keys = Path(folder) / "keys"
-        list(Keyring(keys).change([("recorder", "rec"), *(("source", f"radar-{i}") for i in range(1, 21))]))
+        list(Keyring(keys).change([*PARTIES, *(("source", f"radar-{i}") for i in range(1, 21))]))
         worlds = World(free_endpoint(), None), World(free_endpoint(), keys)
         stop = spawn.Event()
-        hubs = [spawn.Process(target=hub, args=(world, stop)) for world in worlds]
+        hubs = [spawn.Process(target=what, args=(world, stop)) for world in worlds for what in (hub, centre)]
         for one in hubs:
             one.start()
         try:
@@ -143,6 +193,7 @@ def main() -> None:
             }
             for size in (200, 2000, 20_000):
                 compare(worlds, size, 1000, latency, how)
+            compare(worlds, 0, 20, {f"line {name}": figure for name, figure in latency.items()}, how)
             load: dict[str, Callable[[Result], float]] = {
                 "messages/s": lambda result: result.rate,
                 "CPU per message, us": lambda result: result.cost,

@@ -31,7 +31,7 @@ def test_the_smallest_installation_with_certificates_in_its_config(tmp_path: Pat
     config.write_text(service + (place / "security.toml").read_text())
     radar = ["simulate", "three-radars", "--sensor", "radar1", "--duration", "2", "--speed", "20"]
     with Program(SERVICE, "run", "--hub", "--config", str(config)):
-        where = ["--connect", endpoint, "--security", keys / "source-radar1"]
+        where = ["--connect", endpoint, "--security", str(keys / "source-radar1")]
         code, said = command("sensor_clients", *radar, *where)
         assert code == 0, said
         orders = ["order", "list", "--centre", "main", "--connect", endpoint]
