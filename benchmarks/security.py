@@ -36,7 +36,7 @@ from schemas import Enu, GlobalTracks, Motion, decode, global_key
 from sensor_clients.publisher import TrackPublisher
 
 PARTIES = (("recorder", "rec"), ("centre", "main"), ("viewer", "wall"))
-KEY = "fusion/v1/local/radar-1/tracks"
+KEY = "fusion/v1/local/radar-1/load"
 
 
 def free_endpoint() -> str:

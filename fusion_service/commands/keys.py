@@ -7,7 +7,6 @@ import threading
 
 from fusion_service.bus.roles import ROLES
 from fusion_service.process import argument, positive
-from schemas import check_name, check_realm
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
@@ -34,6 +33,18 @@ MEANINGS = {
 }
 
 
+def _name(text: str) -> str:
+    from schemas import check_name
+
+    return check_name(text)
+
+
+def _realm(text: str) -> str:
+    from schemas import check_realm
+
+    return check_realm(text)
+
+
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
     parser.add_argument("folder", metavar="DIR", help="where the authority and the folders of the parties are")
@@ -42,7 +53,7 @@ def add(parser: argparse.ArgumentParser) -> None:
             f"--{role}",
             action="append",
             default=[],
-            type=argument(check_name),
+            type=argument(_name),
             metavar="NAME",
             help=f"a new party: {MEANINGS[role]}",
         )
@@ -59,7 +70,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--days", type=argument(positive), default=365.0, help="how long certificates hold (default 365)"
     )
     parser.add_argument(
-        "--realm", type=argument(check_realm), help="first part of every key (default: as before, or fusion)"
+        "--realm", type=argument(_realm), help="first part of every key (default: as before, or fusion)"
     )
     parser.add_argument("--zenohd", action="store_true", help="print the hub's rules as the config of a zenohd")
     parser.add_argument(
