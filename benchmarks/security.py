@@ -136,11 +136,13 @@ def line(world: World, seconds: float) -> Result:
     ):
         bus.subscribe(global_key("main", "tracks"), shown, history=0)
         radar.info(frame=site, position=(0, 0, 0), period=0.05, motion=Motion("cv", 1.0))
-        means = np.arange(20.0)[:, None] * [1000.0, 0.0, 0.0, 0.0] + [0.0, 500.0, 5.0, 0.0]
+        rng = np.random.default_rng(1)
+        begin = np.arange(20.0)[:, None] * [1000.0, 0.0, 0.0, 0.0] + [0.0, 500.0, 5.0, 0.0]
         covariances = np.tile(np.diag([25.0, 25.0, 1.0, 1.0]), (20, 1, 1))
         for number in range(round(20 * (seconds + 0.5))):
             if number == 10:  # the first ones are the beginning of all
                 took.clear()
+            means = begin + [0.25 * number, 0.0, 0.0, 0.0] + rng.normal(size=(20, 4)) * [5.0, 5.0, 1.0, 1.0]
             at = time.time_ns()
             sent[at] = time.monotonic_ns()
             radar.tracks(

@@ -182,13 +182,22 @@ def _rights(session: Any, common: str) -> Mapping[str, Sequence[str]] | None:
         for key in (hello_key(common), ANYONE):
             for reply in session.get(key, timeout=HELLO_PATIENCE):
                 if reply.ok and key != ANYONE:
-                    rights: Mapping[str, Sequence[str]] = json.loads(bytes(reply.ok.payload))
-                    return rights
+                    return _read_rights(bytes(reply.ok.payload))
                 if reply.ok and not again:
                     raise BusError(f"lets {common} say and hear nothing: it is not in its file, under [security] roles")
         time.sleep(RETRY if again else 0.0)
     log.warning("the hub does not say what %s may do: what is forbidden there gets lost without a word", common)
     return None
+
+
+def _read_rights(data: bytes) -> Mapping[str, Sequence[str]]:
+    """Raises `BusError` if it is none."""
+    try:
+        raw = json.loads(data)
+        keys = {act: [str(zenoh.KeyExpr(one)) for one in raw[act]] for act in ("publish", "subscribe", "ask")}
+        return keys | {"who": [str(one) for one in raw["who"]]}
+    except (ValueError, TypeError, KeyError, zenoh.ZError) as error:
+        raise BusError(f"answers what is not understood: is it of another version? ({error})") from None
 
 
 def reason(error: Exception) -> str:
