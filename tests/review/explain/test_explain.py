@@ -209,8 +209,8 @@ def test_who_leaves_and_why(joined: tuple[Path, Flight]) -> None:
 
 
 def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
-    """r1, which judges existence, lists its track no more at 5 s: it ends with the next report; r2 is muted at 8 s: its track coasts for 3 s;
-    track 3 of r3 is deleted by order at 12 s."""
+    """r1, which judges existence, lists its track no more at 5 s: it ends with the next report; r2 is muted at 8 s:
+    its track coasts for 3 s; track 3 of r3 is deleted by order at 12 s."""
     flight = Flight({"coast": 3.0})
 
     def seen_by(name: str, second: float) -> dict[int, Sequence[float]]:
