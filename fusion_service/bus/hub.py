@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 import threading
 import time
 from collections.abc import Iterator, Sequence
@@ -22,6 +23,8 @@ __all__ = ["open_hub", "run_hub"]
 
 LINES = 20
 """Log lines a second about who comes and goes, at most."""
+_HERE = re.compile(r"\w+/(localhost|127\.|\[::1\])")
+"""Endpoints that only this computer reaches."""
 log = logging.getLogger(__name__)
 
 
@@ -48,7 +51,10 @@ def open_hub(listen: Sequence[str], security: Security | None = None) -> Iterato
         tell_refusals()
     with open_bus(listen=listen, mode="router", security=security) as bus:
         if security is None:
-            log.warning("the hub lets anybody in, as anybody: `fusion-service keys` makes certificates for --security")
+            level = logging.INFO if all(_HERE.match(one) for one in listen) else logging.WARNING
+            log.log(
+                level, "the hub lets anybody in, as anybody: `fusion-service keys` makes certificates for --security"
+            )
         else:
             door = _Door(security)
             bus.answer_each(f"{HELLO}/party/*", door.hello)
