@@ -49,7 +49,7 @@ class Rows:
 
     def linked(self) -> NDArray[np.intp]:
         """Rows that belong to a global track."""
-        return np.flatnonzero(self.tracks.link != NO_TRACK)
+        return (self.tracks.link != NO_TRACK).nonzero()[0]
 
     def inside_mask(self) -> NDArray[np.bool_]:
         """`inside` as a mask (M,)."""
@@ -58,4 +58,4 @@ class Rows:
 
     def inside(self) -> NDArray[np.intp]:
         """Rows that belong to a global track and are fused in it: their newest datum has passed its gate."""
-        return np.flatnonzero(self.inside_mask())
+        return self.inside_mask().nonzero()[0]

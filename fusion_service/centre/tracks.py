@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, marked
 from fusion_service.centre.words import Codes
 from fusion_service.densities import Mixtures
 from fusion_service.records import altered, columns_of
@@ -256,7 +256,7 @@ def taken(columns: Any, rows: Any) -> Any:
         return type(columns)(*(column.take(rows, axis=-1) for column in columns_of(columns)))
     if rows.all():
         return columns
-    at = np.flatnonzero(rows)
+    at = marked(rows)
     return type(columns)(*(column.take(at, axis=-1, mode="clip") for column in columns_of(columns)))
 
 

@@ -27,7 +27,10 @@ def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
 
 
 def _fits(a: Floats, *others: Floats) -> bool:
-    return a.dtype == F8 and a.size > 0 and all(one.dtype == F8 for one in others)
+    for one in others:
+        if one.dtype != F8:
+            return False
+    return a.dtype == F8 and a.size > 0
 
 
 def _one(a: Floats, core: int) -> Floats:
