@@ -52,10 +52,11 @@ def among(values: NDArray[np.integer[Any]], some: NDArray[np.integer[Any]]) -> B
     return found
 
 
-def marked(mask: Bools) -> Ints:
-    """`np.flatnonzero(mask)` of a flat mask, without what that does beside it, which is most of it where rows are
+def marked(mask: Any) -> Ints:
+    """`np.flatnonzero(mask)` of a flat array (K,), without what that does beside it, which is most of it where rows are
     few."""
-    return mask.nonzero()[0]
+    at: Ints = mask.nonzero()[0]
+    return at
 
 
 def picked(array: NDArray[Number], rows: Any) -> NDArray[Number]:

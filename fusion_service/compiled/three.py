@@ -96,7 +96,7 @@ def _looked_at(D: Floats, w: Floats, M: Floats, P: Floats, g: Floats) -> float:
         g[k] = -value
     if g[0] != g[0] or g[1] != g[1] or g[2] != g[2]:
         return np.nan
-    return (w[0] * g[0] + w[1] * g[1]) + w[2] * g[2] - min(g[0], g[1], g[2])
+    return float((w[0] * g[0] + w[1] * g[1]) + w[2] * g[2] - min(g[0], g[1], g[2]))
 
 
 def _inverted(M: Floats, P: Floats) -> None:
@@ -136,7 +136,7 @@ def _sought(
     for last in range(int(limits[2]), -1, -1):
         left = _looked_at(D, w, M, P, g)
         if not left > limits[1]:
-            return left <= limits[1]
+            return bool(left <= limits[1])
         if last == 0:
             break
         for i in range(n):
