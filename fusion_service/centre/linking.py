@@ -274,7 +274,7 @@ class Linker:
         """Join global tracks that share no source and that the evidence says are one: {newer id: older id}. left: pairs
         of which one was emptied into the other, which are one unless the evidence says that they are two."""
         pairs = near.tracks
-        if not len(pairs.first) and not len(self.merges.sums.older):
+        if not (left or len(pairs.first) or len(self.merges.sums.older)):
             return {}
         if len(pairs.first):
             masks = _masks(rows, now)
