@@ -7,6 +7,7 @@ step fail, the centre goes on from its last checkpoint under a new id generation
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 import time
@@ -113,6 +114,8 @@ class Service:
         rule = centre.rule if centre.kind == "tracks" else f"{centre.intensity_rule} of intensities"
         log.info("fusing by %s, memory %s, every %g s as %s", rule, centre.memory, centre.period, centre.name)
         status_due = time.monotonic() + self._config.service.status_period
+        gc.collect()
+        gc.freeze()  # what is loaded stays: it is not looked through again in the middle of a step
         while not stop.is_set():
             timeout = max(0.0, status_due - time.monotonic())
             for item in self._take(min(timeout, self._times.wait(time.time_ns()))):
