@@ -38,6 +38,7 @@ from fusion_service.centre.refusing import fault
 from fusion_service.centre.scans import Scan, as_tracks, message_tracks, size_of
 from fusion_service.centre.sources import Source
 from fusion_service.centre.spared import Spared
+from fusion_service.centre.sparing import by_moments, too_costly
 from fusion_service.centre.tracks import Tracks, empty_tracks
 from fusion_service.centre.treatment import AS_IT_IS, Treatment
 from fusion_service.centre.words import Lexicon, Words
@@ -351,6 +352,10 @@ class Intake:
             ((source, as_tracks(message, faults), entry), faults)
             for (source, message, entry), faults in zip(items, codes, strict=True)
         ]
+        for index in too_costly([one for (_, one, _), _ in checked], self.config):
+            (source, one, entry), faults = checked[index]
+            checked[index] = (source, by_moments(one), entry), faults
+            journal.event({"kind": "moments", "source": source.name, "tracks": len(one.ids)})
         self._settle_frame(checked, time, journal)
         checked = [((source, _framed(one, self.frame), entry), faults) for (source, one, entry), faults in checked]
         for _, run in groupby(enumerate(checked), key=_run_key):
