@@ -11,13 +11,14 @@ that failed, and whether all honest targets are in the picture at the end.
 from __future__ import annotations
 
 import argparse
-import resource
 import signal
+import subprocess
+import sys
 import tempfile
 import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 import msgpack
@@ -138,6 +139,32 @@ FLOODS: dict[str, Callable[[Bus], None]] = {
 }
 
 
+class Service:
+    """The service as a process, what it says in a file; it is killed at the end of the `with` block."""
+
+    def __init__(self, config: Path) -> None:
+        command = [sys.executable, "-c", COMMAND, "run", "--config", str(config)]
+        with config.with_suffix(".log").open("ab") as said:
+            self._process = subprocess.Popen(command, stdout=said, stderr=said)
+
+    def __enter__(self) -> Service:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+
+    def end(self) -> tuple[float, int]:
+        """Seconds from SIGTERM to its end, and its exit code."""
+        begin = time.monotonic()
+        self._process.send_signal(signal.SIGTERM)
+        code = self._process.wait(60)
+        return time.monotonic() - begin, code
+
+
 class Watch:
     """When statuses came, and what they said."""
 
@@ -182,10 +209,8 @@ class Watch:
     def _ask(self) -> None:
         while not self._stop.wait(0.25):
             begin = time.monotonic()
-            try:
+            with suppress(BusError):
                 self._bus.ask(schemas.global_key("centre", "orders"), timeout=30.0)
-            except BusError:
-                pass
             self.answered = max(self.answered, time.monotonic() - begin)
 
     def silence(self, begin: float) -> float:
@@ -202,7 +227,7 @@ def flood(name: str, seconds: float, centre: str = "", restart: bool = False) ->
         config.write_text(CONFIG.format(centre=centre, endpoint=hub.endpoint, state=Path(folder) / "state"))
         bus = stack.enter_context(open_bus([hub.endpoint], wait=10.0))
         watch = Watch(bus)
-        service = stack.enter_context(Program(COMMAND, "run", "--config", str(config)))
+        service = stack.enter_context(Service(config))
         for one in ("r1", "r2"):
             sensor = stack.enter_context(Program(SENSOR, hub.endpoint, one, "given", *map(str, sorted(HONEST))))
             sensor.line()
@@ -221,7 +246,7 @@ def flood(name: str, seconds: float, centre: str = "", restart: bool = False) ->
         line = f"{name:11} sent in {sent:5.1f} s; silence {during:5.2f} s, senders gone {after:5.2f} s"
         if restart:
             service.kill()
-            service = stack.enter_context(Program(COMMAND, "run", "--config", str(config)))
+            service = stack.enter_context(Service(config))
             again = time.monotonic()
             count = len(watch.at)
             eventually(lambda: len(watch.at) > count, 60)
@@ -233,20 +258,14 @@ def flood(name: str, seconds: float, centre: str = "", restart: bool = False) ->
         assert status is not None
         honest = watch.targets() == HONEST
         watch.close()
-        ended = time.monotonic()
-        service.signal(signal.SIGTERM)
-        try:
-            code, errors = service.end(60)
-        except Exception as error:
-            code, errors = -1, str(error)
-        wanted = ("failed", "skipped", "max", "unsaved")
-        said = {name: round(status.step_time[name], 2) for name in wanted}
+        ended, code = service.end()
+        wanted = ("failed", "failed_turns", "skipped", "max", "busy")
+        said = {name: round(status.step_time[name], 2) for name in wanted if status.step_time.get(name)}
         line += (
-            f"; answers {watch.answered:.2f} s; end {time.monotonic() - ended:.2f} s code {code};"
-            f" honest {'yes' if honest else 'NO'}; {said}; {status.memory >> 20} MiB;"
+            f"; answers {watch.answered:.2f} s; end {ended:.2f} s code {code};"
+            f" honest {'yes' if honest else 'NO'}; {said}; {(status.memory or 0) >> 20} MiB;"
             f" {len(status.sources)} sources, {len(status.dropped)} dropped; {len(watch.last)} bytes of status"
         )
-        Path(f"/tmp/ans/{name}.err").write_text(errors) if Path("/tmp/ans").exists() else None
         return line
 
 
@@ -264,4 +283,3 @@ def main(argv: list[str] | None = None) -> None:
 
 if __name__ == "__main__":
     main()
-    assert resource

@@ -13,10 +13,23 @@ from dataclasses import replace
 
 import numpy as np
 
+from fusion_service.centre.batches import Checked
+from fusion_service.centre.journal import Journal
 from fusion_service.config import CentreConfig
 from schemas import LocalTracks
 
-__all__ = ["by_moments", "pairs_of", "too_costly"]
+__all__ = ["affordable", "by_moments", "pairs_of", "too_costly"]
+
+
+def affordable(checked: list[Checked], config: CentreConfig, journal: Journal) -> list[Checked]:
+    """A step's messages, in canonical order, those that cost too much by their moments, which the journal is told."""
+    chosen = too_costly([one for (_, one, _), _ in checked], config)
+    checked = list(checked) if chosen else checked
+    for index in chosen:
+        (source, one, entry), faults = checked[index]
+        checked[index] = (source, by_moments(one), entry), faults
+        journal.event({"kind": "moments", "source": source.name, "tracks": len(one.ids)})
+    return checked
 
 
 def pairs_of(message: LocalTracks, most: int) -> int:

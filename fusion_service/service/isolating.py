@@ -23,27 +23,17 @@ class TooManyTries(Exception):
     """It is not found within `MOST_TRIES`."""
 
 
-class _Tries:
-    """`fails`, which is asked `MOST_TRIES` times at most."""
-
-    def __init__(self, fails: Callable[[list[Item]], bool]) -> None:
-        self._fails: Callable[[list[Item]], bool] = fails  # type: ignore[assignment]
-        self._left = MOST_TRIES
-
-    def fail(self, items: list[Item]) -> bool:
-        self._left -= 1
-        if self._left < 0:
-            raise TooManyTries
-        return self._fails(items)  # type: ignore[arg-type]
-
-
 def culprits(items: Sequence[tuple[str, Item]], fails: Callable[[list[Item]], bool]) -> list[int]:
     """The places of those of `items`, (source, message) in the order in which they came, without which a step does not
     fail: fails: whether it does with some of them. Empty where it fails with none at all. Raises `TooManyTries`."""
-    tries = _Tries(fails)
+    tries = 0
 
     def bad(places: Sequence[int]) -> bool:
-        return tries.fail([items[place][1] for place in sorted(places)])
+        nonlocal tries
+        tries += 1
+        if tries > MOST_TRIES:
+            raise TooManyTries
+        return fails([items[place][1] for place in sorted(places)])
 
     left = list(range(len(items)))
     found: list[int] = []
