@@ -170,7 +170,7 @@ def test_every_kind_of_source_alone_makes_a_picture(kind: str) -> None:
     for table in tables if kind != "intensity" else [{"kind": "intensity"}, {}]:
         shown = fly(table, [kind, kind])
         fits = (kind == "intensity") is ("kind" in table) or (kind == "ecef" and "space" not in table)
-        if fits and not (kind == "ecef"):
+        if fits and kind != "ecef":
             assert max(shown) >= len(TARGETS), (table, shown)
 
 
