@@ -128,8 +128,8 @@ class Intake:
             source.muted = self.config.source(name).ignore or name in self.orders.about("mute")
 
     def waits_for(self, name: str) -> bool:
-        """Whether a message of this source is queued."""
-        return self._held[name] > 0
+        """Whether a message of this source is queued, or its token came or went."""
+        return self._held[name] > 0 or name in self._present
 
     def _is_full(self, message: Message) -> bool:
         full = len(self.queue) >= limits.MAX_QUEUED or self._components + size_of(message) > limits.MAX_COMPONENTS
@@ -284,6 +284,7 @@ class Intake:
     def admitted(self, name: str, speaks: bool = True) -> Source | None:
         """The source of that name, made if there is room: the longest silent dead one goes for it, and for one that
         speaks one of which there was nothing but a token."""
+        self.wake(name)
         if name in self.sources:
             return self.sources[name]
         try:
