@@ -131,7 +131,7 @@ def test_one_that_rests_is_awake_with_whatever_comes(how: str) -> None:
         assert "resting" not in result.status.sources["n"]
         assert result.status.sources["n"]["messages"] == (3 if how == "message" else 2)
         assert result.status.sources["n"]["muted"] is (how == "order")
-        give(one, tracks("n", 20, [[5e4, 0, 0, 0]], seq=9, epoch=2))
+        give(one, tracks("n", 20.5, [[5e4, 0, 0, 0]], seq=9, epoch=2))
         assert step(one, 21).status.refused.get("old-epoch", 0) == (how == "message")
     assert made.checkpoint() == again.checkpoint()
 
@@ -187,4 +187,4 @@ def test_resting_sources_cost_next_to_nothing() -> None:
             spent.append(time.process_time() - begin)
         return float(np.median(spent))
 
-    assert (cost(400) - cost(0)) / 400 < 15e-6  # 2-3 us; 130-240 us were it to be asked in every loop
+    assert (cost(400) - cost(0)) / 400 < 40e-6  # 2-3 us on an idle machine; 130-240 us were it in every table
