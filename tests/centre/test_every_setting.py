@@ -132,7 +132,7 @@ def fly(table: dict[str, Any], kinds: list[str]) -> list[int]:
     made, fault = make_centre(centre_config({"lateness": 1.0, "frame_wait": 1.0, **table}))
     assert not fault
     shown = []
-    for second in range(1, 9):
+    for second in range(1, 7):
         now = START + second * SECOND
         for number, kind in enumerate(kinds):
             name = f"{number:02d}-{kind}"
@@ -142,9 +142,9 @@ def fly(table: dict[str, Any], kinds: list[str]) -> list[int]:
                     frame = schemas.Local("yard") if kind == "local" else FRAME
                     coverage = schemas.Disk(20_000.0)
                     made.handle(info(name, frame=frame, coverage=coverage, detection_probability=0.9), now)
-            if second == 7:
+            if second == 5:
                 made.handle(SourceLost(name), now)
-            if second % 3 and second < 7 and (second + number) % 4:
+            if second % 3 and (second + number) % 4:
                 made.handle(KINDS[kind](name, second - 0.1), now)
         result = made.step(now)
         schemas.encode(result.tracks)
