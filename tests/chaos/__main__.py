@@ -56,9 +56,7 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="fuzz and chaos, and what got through")
     parser.add_argument("--minutes", type=float, default=5.0, help="for all parts together (default 5)")
     parser.add_argument("--part", action="append", choices=PARTS, help="only this one; may be said again")
-    parser.add_argument(
-        "--seed", type=int, default=time.time_ns() % 10**6, help="that of an earlier run: the same again"
-    )
+    parser.add_argument("--seed", type=int, default=time.time_ns() % 10**6, help="of an earlier run: the same again")
     parser.add_argument("--keep", type=Path, help="folder for the bytes of messages that got through")
     args = parser.parse_args(argv)
     if args.keep is not None:
