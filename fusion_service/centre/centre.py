@@ -31,7 +31,7 @@ from fusion_service.centre.journal import Journal, start_event
 from fusion_service.centre.judging import View
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import empty_picture
-from fusion_service.centre.naming import Book
+from fusion_service.centre.naming import Book, LocalKey
 from fusion_service.centre.obeying import heirs, obey, view_of
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.publishing import Contributions, picture_message
@@ -94,6 +94,7 @@ class Centre(ABC):
             state, self._picture = unpack_state(checkpoint, self._intake, self._labels)
             self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
             self._era.unpack(state["era"])
+            self._ids.promised.restore(state["promised"])
             try:
                 if state["own"] is not None:
                     self._restore(state["own"])
@@ -182,6 +183,8 @@ class Centre(ABC):
         self._other = {}
         self._intake.orders.follow(gone_on)
         self._labels.follow(rows, self._picture, names, gone_on, time, journal)
+        for track in self._ids.promised.settle(self._picture.id, time):
+            journal.end(track, "lost", None)
         return contributions
 
     def _begin_step(self, time: int, events: tuple[tuple[Event, int], ...], left: int) -> Past:
@@ -243,6 +246,7 @@ class Centre(ABC):
         self._begin()
         kept, self._picture = unpack_state(state or b"", self._intake, self._labels)
         self._step, self._time = kept["step"], kept["time"]
+        self._ids.promised.restore(kept["promised"])
         self._restore(kept["own"])
         self._state = state
 
@@ -263,9 +267,16 @@ class Centre(ABC):
         """Forget global tracks that have ended since the checkpoint that this centre was made from; how many it had."""
         gone = np.isin(self._picture.id, tracks)
         self._forget(self._picture.id[gone].tolist())
+        self._ids.promised.drop(tracks.tolist())
         self._picture = self._picture.take(~gone)
         self._state = None
         return int(gone.sum())
+
+    def promise(self, born: Iterable[tuple[LocalKey, int]]) -> None:
+        """Ids that were published for these local tracks since the checkpoint that this centre was made from: tracks
+        that they begin take them."""
+        self._ids.promised.add(born)
+        self._state = None
 
     def checkpoint(self) -> bytes:
         """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""
@@ -275,6 +286,7 @@ class Centre(ABC):
             "time": self._time,
             "next_id": self._ids.next,
             "era": self._era.pack(),
+            "promised": self._ids.promised.packed(),
             "own": self._kept(),
         }
         self._state = pack_state(self.config_hash, state, self._intake, self._labels, self._picture)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections import deque
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, cast
 
 import msgpack
 import numpy as np
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fusion_service.centre.intake import Intake
     from fusion_service.centre.labels import Labels
 
-__all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
+__all__ = ["CHECKPOINT_VERSION", "CheckpointError", "Glance", "glance", "pack_state", "unpack_state"]
 
 CHECKPOINT_VERSION = 2
 READABLE = (1, 2)
@@ -100,7 +100,25 @@ def unpack_state(blob: bytes, intake: Intake, labels: Labels) -> tuple[dict[str,
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
     intake.mute()
-    return {**numbers, "era": era, "own": whole.get("own")}, picture
+    promised = whole.get("promised", {"since": -1, "ids": []})
+    return {**numbers, "era": era, "own": whole.get("own"), "promised": promised}, picture
+
+
+class Glance(NamedTuple):
+    """Of a checkpoint: the time of its step, ns, -1 before the first, and the generation of the newest id given."""
+
+    time: int
+    generation: int
+
+
+def glance(blob: bytes) -> Glance:
+    """What a checkpoint says at a glance; (-1, 0) of one that cannot be read."""
+    try:
+        whole = msgpack.unpackb(blob)
+        time, following = int(whole["time"]), int(whole["next_id"])
+    except Exception:
+        return Glance(-1, 0)
+    return Glance(time, following >> 32) if 0 <= following < 2**64 else Glance(-1, 0)
 
 
 def _restore_words(whole: dict[str, Any], sources: dict[str, Source], intake: Intake, labels: Labels) -> None:

@@ -282,6 +282,7 @@ class Service:
             alive=self._tokens.told,
             skipped=self._times.skipped,
             overload=None if self._overload.since is None else time.monotonic() - self._overload.since,
+            alarm=self._lasting.alarm,
         )
         if self._overload.since is not None and status.notes:
             self._told.warn("%s", status.notes[0])

@@ -57,9 +57,11 @@ class StatusMaker:
         alive: Mapping[str, bool],
         skipped: int,
         overload: float | None = None,
+        alarm: str = "",
     ) -> Status:
         """The status now. last: the centre's own, of its newest step; refused: by reason; alive: whether each source is
-        there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not."""
+        there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not;
+        alarm: what is not on disk that should be."""
         uptime = time.monotonic() - self._started
         counts, now = self.counts, time.time_ns()
         recent, span = counts - self._before, max(uptime - self._before_at, 1e-3)
@@ -101,7 +103,7 @@ class StatusMaker:
             },
             road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            notes=self._notes(last, skipped, overload),
+            notes=(*(self._notes(last, skipped, overload) or ()), *filter(None, [alarm])) or None,
         )
 
     def _notes(self, last: Status | None, skipped: int, overload: float | None) -> tuple[str, ...] | None:

@@ -72,9 +72,9 @@ def test_what_is_wrong_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StateError, match="cannot be used"), open_state(str(tmp_path / "file")):
         pass
-    (tmp_path / "generation").write_text("seven")
-    with open_state(str(tmp_path)) as state, pytest.raises(StateError, match="delete it"):
-        state.new_generation()
+    (tmp_path / "link").symlink_to(tmp_path)
+    with pytest.raises(StateError, match="name the folder itself"), open_state(str(tmp_path / "link")):
+        pass
 
 
 def test_without_a_folder_generations_still_grow() -> None:
