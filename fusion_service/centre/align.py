@@ -82,7 +82,7 @@ def _used(intake: Intake, time: int) -> list[_Used]:
     room = MAX_TOTAL // max(len(intake.sources), 1)
     for number, (name, source) in enumerate(sorted(intake.sources.items())):
         said = intake.declared(source)
-        table = retire(source, said, time, room, intake.config)
+        table = retire(source, said, time, room, intake.config, intake.spared.awake)
         if source.muted or not intake.ready(source):
             leave_out(source)
         else:

@@ -118,7 +118,7 @@ class Centre(ABC):
         if isinstance(event, Skipped):
             self._journal.event({"kind": "skipped", "steps": event.steps})
             self._history.behind()
-        elif not isinstance(event, (ClockSet, NewEra)):
+        if not isinstance(event, (ClockSet, NewEra)):
             self._intake.put(event, received)
             self._history.note(event, received)
 
@@ -209,7 +209,8 @@ class Centre(ABC):
         start = self._history.start(late) if self._history.on else None
         if start is None:
             return None
-        revision = Revision(self._history, start, late, self._intake, self._picture.id, self._ids.next)
+        ids = self._ids.known(self._picture.id)
+        revision = Revision(self._history, start, late, self._intake, ids, self._ids.next)
         own, queue = self._journal, revision.left(self._intake.emptied())
         self._go_back(revision)
         for place, past in enumerate(revision.steps):
@@ -224,7 +225,11 @@ class Centre(ABC):
         if self._ids.book is not None:
             there = revision.there.union(one for one in self._picture.id.tolist() if one >= revision.following)
             self._go_on_as(self._ids.book.done(self._picture.id.tolist(), there, self._ids.fresh))
-        return revision.tell(own, self._intake, self._picture.id, self._other)
+            waiting = self._ids.known(self._picture.id[:0])
+            over = waiting[(waiting < revision.following) & ~np.isin(waiting, ids)]
+            self._stop_waiting(over)
+            self._ids.promised.drop(over.tolist())
+        return revision.tell(own, self._intake, self._ids.known(self._picture.id), self._other)
 
     def _go_on_as(self, new: dict[int, int]) -> None:
         """Tracks that have ended, and are there after all, take other ids: {old: new}."""
@@ -241,7 +246,7 @@ class Centre(ABC):
             self._ids.book.again(revision.steps[0].number - 1, revision.tables, revision.there)
         state = revision.steps[0].state
         self._intake = Intake(self.config)
-        self._intake.spared = copy(revision.steps[0].spared)
+        self._intake.spared = revision.steps[0].spared.rested()
         self._labels = Labels(self._intake)
         self._begin()
         kept, self._picture = unpack_state(state or b"", self._intake, self._labels)
@@ -270,7 +275,7 @@ class Centre(ABC):
         self._ids.promised.drop(tracks.tolist())
         self._picture = self._picture.take(~gone)
         self._state = None
-        return int(gone.sum())
+        return int(gone.sum()) + self._stop_waiting(tracks)
 
     def promise(self, born: Iterable[tuple[LocalKey, int]]) -> None:
         """Ids that were published for these local tracks since the checkpoint that this centre was made from: tracks
@@ -330,6 +335,10 @@ class Centre(ABC):
         """What the status says of sources, by name, beside what every kind of centre says."""
         return {}
 
+    def _stop_waiting(self, tracks: NDArray[np.uint64]) -> int:
+        """Suspended tracks that do not come back; how many of them there were."""
+        return 0
+
     @abstractmethod
     def _forget(self, tracks: Iterable[int]) -> None:
         """Undo whatever refers to global tracks that are no more."""
@@ -359,4 +368,5 @@ class Centre(ABC):
     def _numbers(self) -> dict[str, int]:
         kinds = np.bincount(self._picture.status, minlength=len(messages.STATUSES)).tolist()
         counts = {name: kinds[code] for code, name in enumerate(messages.STATUSES)}
+        counts |= {"suspended": len(self._ids.waiting)} if len(self._ids.waiting) else {}
         return counts | self._labels.numbers()

@@ -71,6 +71,7 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: 
         "labels": labels.kept(),
         "said": [words.texts for words in intake.said],
         "lineages": intake.lineages.kept(),
+        "awake": intake.spared.awake,
         **state,
     }
     return cast(bytes, msgpack.packb(whole))
@@ -99,6 +100,7 @@ def unpack_state(blob: bytes, intake: Intake, labels: Labels) -> tuple[dict[str,
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
+    intake.spared.awake = int(whole.get("awake", -1))
     intake.mute()
     promised = whole.get("promised", {"since": -1, "ids": []})
     return {**numbers, "era": era, "own": whole.get("own"), "promised": promised}, picture
@@ -156,7 +158,9 @@ def _unpack_source(name: str, packed: dict[str, Any]) -> Source:
             setattr(source, plain, packed[plain])
     if "remembered" in packed:
         kinds = NOTHING_REMEMBERED
-        columns = (from_bytes(one, like) for one, like in zip(packed["remembered"], kinds, strict=True))
+        columns = [from_bytes(one, like) for one, like in zip(packed["remembered"], kinds, strict=False)]
+        if len(columns) < len(kinds):  # of an earlier release
+            columns.append(np.zeros_like(columns[0]))
         source.remembered = Remembered(*columns)
     if "vote" in packed:
         spoken, names, time = packed["vote"]

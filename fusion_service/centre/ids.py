@@ -15,12 +15,14 @@ __all__ = ["Ids"]
 
 class Ids:
     """The ids that are given from now on, in order. next: the first of them. book: the births that may be made again;
-    None where none is. promised: ids that wait for the local tracks that they were given for."""
+    None where none is. promised: ids that wait for the local tracks that they were given for;
+    waiting: those of suspended tracks, sorted."""
 
     def __init__(self) -> None:
         self.next = 1
         self.book: Book | None = None
         self.promised = Promised()
+        self.waiting: NDArray[np.uint64] = np.zeros(0, dtype=np.uint64)
 
     def begin(self, generation: int) -> None:
         """Go on with the ids of a generation that was never used."""
@@ -40,6 +42,12 @@ class Ids:
             return np.array(self.book.allot(groups, self.fresh, known), dtype=np.uint64)
         new = iter(self.fresh(known.count(None)))
         return np.array([next(new) if one is None else one for one in known], dtype=np.uint64)
+
+    def known(self, there: NDArray[np.uint64]) -> NDArray[np.uint64]:
+        """The ids `there`, sorted, and those that may come back."""
+        if not len(self.waiting) and not self.promised:
+            return there
+        return np.unique(np.concatenate([there, self.waiting, self.promised.ids]))
 
     def fresh(self, count: int) -> list[int]:
         """So many new ones."""

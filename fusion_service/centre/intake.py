@@ -102,7 +102,7 @@ class Intake:
         elif isinstance(event, Refused):
             self._count(event.source, event.reason, max(event.count, 1), event.dropped)
         elif isinstance(event, (ClockSet, NewEra, Skipped)):
-            return
+            self.spared.sleep(event)
         elif self._is_full(event):
             self._count(source_of(event), "pending", 1, dropped=True)
         else:
@@ -123,6 +123,7 @@ class Intake:
     def succeed(self, other: Intake) -> None:
         """Take over what is queued in `other` beside messages."""
         self._given, self._present, self._refused = other._given, other._present, other._refused
+        self.spared.slept_as(other.spared)
 
     def _is_full(self, message: Message) -> bool:
         full = len(self.queue) >= MAX_QUEUED or self._components + size_of(message) > MAX_COMPONENTS
@@ -226,7 +227,7 @@ class Intake:
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):
             (journal.drop if dropped else journal.refuse)(Entry(name, 0, 0, 0, reason, count))
-        self.spared.note({name for name, _, dropped in self._refused if dropped}, time)
+        self.spared.note({name for name, _, dropped in self._refused if dropped}, time, last)
         self._present, self._refused = {}, Counter()
         self._accept(self._due(time, journal), time, last, journal)
 

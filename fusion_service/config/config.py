@@ -55,9 +55,9 @@ __all__ = [
 ]
 
 
-LATER = ("trigger", "arrival_spacing", "revise", "weights", "compiled")
+LATER = ("trigger", "arrival_spacing", "revise", "weights", "compiled", "suspend")
 """Settings that came after hashes were recorded; their defaults are what there was before, or `BEFORE` says."""
-BEFORE: dict[str, Any] = {"revise": 0.0, "weights": "best"}
+BEFORE: dict[str, Any] = {"revise": 0.0, "weights": "best", "suspend": False}
 """What stands where recorded settings do not say them."""
 
 
@@ -202,7 +202,14 @@ class CentreConfig:
     stale_periods: float = _setting(
         3.0, number(1, 1e6), "a source (or track) is stale after so many of its own periods, and lateness"
     )
-    remember: float = _setting(600.0, DURATION, "seconds for which a stale track's id and interval are remembered")
+    remember: float = _setting(
+        600.0,
+        DURATION,
+        "seconds for which a stale track's id, link and interval, and a suspended track, are remembered",
+    )
+    suspend: bool = _setting(
+        True, flag, "tracks that only sources silent as a whole could see are suspended, and do not end, after coast"
+    )
     intensity_rule: str = _setting(
         "hybrid",
         choice("aa", "ga", "hybrid"),
