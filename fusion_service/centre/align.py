@@ -30,7 +30,7 @@ from fusion_service.densities import Mixtures
 from fusion_service.records import altered
 from schemas import Entry, Frame, Motion
 
-__all__ = ["predict_tracks", "usable_rows", "write_back"]
+__all__ = ["PARTS", "predict_tracks", "usable_rows", "write_back"]
 
 PARTS = ("log_weight", "part_mean", "part_covariance")
 
