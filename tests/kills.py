@@ -2,11 +2,11 @@
 
     python -m tests.kills --times 100
 
-Real processes on loopback: a hub, two sources whose targets come and go all the time, the service, and an observer that
-keeps every picture. The service is killed with kill -9 again and again, after a time between nothing and a second and a
-half of pictures, and started again on its state folder. Every target has a place of its own, so that the ids under which
-it was published are known. An id changed where a target has another one than it was first published under; ids must have
-one target each.
+Real processes on loopback: a hub, two sources whose targets come and go all the time, the service, and an observer
+that keeps every picture. The service is killed with kill -9 again and again, after five pictures and a time between
+nothing and a second and a half, and started again on its state folder. Every target has a place of its own, so that the
+ids under which it was published are known. An id changed where a target has another one than it was first published
+under; ids must have one target each.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from tests.helpers.scene import Scene, opened
 
 __all__ = ["Tally", "killed"]
 
-# Targets k at (1000 k, 0), each for some seconds, one more every so often; argv: endpoint, name, seconds between births.
+# Targets k at (1000 k, 0), each for a while, one more every so often; argv: endpoint, name, seconds between births.
 SENSOR = """
 import sys, time
 import numpy as np

@@ -110,6 +110,7 @@ class State:
                 self._unwritten = f"{where}: ids are safe, but what is saved is old: make room"
             except OSError:
                 self._unwritten = f"{where}, with no room for a number: ids are safe while the clock is: make room"
+                time.sleep(min(max(self._last + 1 + YEAR_2020 - time.time(), 0.0), 2.0))  # the next start has another
             log.error("%s", self._unwritten)
             return
         for notes in (self._ended, self._born):
