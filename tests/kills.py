@@ -53,7 +53,7 @@ with TrackPublisher(name, connect=endpoint) as publisher:
 EVERY = 0.4
 CENTRE = "confirm_hits = 3\nconfirm_within = 4\nconfirm_sources = 3"
 """Tracks stay tentative for a while."""
-WAIT = 30.0
+WAIT = 90.0
 
 
 @dataclass

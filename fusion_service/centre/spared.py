@@ -15,6 +15,8 @@ __all__ = ["GRACE", "Spared"]
 
 DEAF = 2.0
 """Seconds of steps not made from which the centre was not there; less is a hiccup."""
+HELD = 60.0
+"""Seconds up to which tracks are held over such a time; what was there before a longer one is no picture of now."""
 GRACE = 3_000_000_000
 """ns after that in which sources may be found again."""
 
@@ -52,7 +54,7 @@ class Spared:
 
     def note(self, dropped: set[str], time: int, last: int) -> None:
         """The step at `time`, ns, after the one at `last`, is told that data of these sources were dropped."""
-        deaf = self._slept >= max(self._deaf, 1) and last >= 0
+        deaf = self._slept >= max(self._deaf, 1) and last >= 0 and time - last <= HELD * 1e9
         self.awake, self.gap = (time, time - last) if deaf else (self.awake, 0)
         self._slept = 0
         self.newest = dropped

@@ -139,21 +139,19 @@ def test_a_track_that_began_after_the_checkpoint_has_its_id_again(
     made = Made(tmp_path, monkeypatch)
     made.step(0.0)
     made.step(0.0)
-    assert made.step(0.0, 9000.0) == 0
-    assert made.step(0.0, 9000.0, 18000.0) == 1, "the second is confirmed"
-    assert made.step(0.0, 9000.0, 18000.0, 27000.0) == 1, "the third is"
+    assert made.step(0.0, 9000.0, 18000.0) == 0
     ids = [int(one) for one in made.result.tracks.ids]
-    assert len(ids) == 4, "the fourth is known by its note alone"
+    assert len(ids) == 3, "two of them are known by their note alone"
     lasting = made.lasting
     if how == "killed":
         lasting = made.again()
-        assert ids[3] not in lasting.centre.view().ids.tolist()
-        assert goes_on(made, lasting, 0.0, 9000.0, 18000.0, 27000.0, 36000.0)[:4] == ids
+        assert lasting.centre.view().ids.tolist() == ids[:1]
+        assert goes_on(made, lasting, 0.0, 18000.0, 27000.0, 9000.0)[:3] == ids
     else:
         lasting.centre.step = None  # type: ignore[method-assign, assignment]
-        made.step(0.0, 9000.0, 18000.0, 27000.0)
+        made.step(0.0, 9000.0, 18000.0)
         assert made.counts["failed_steps"] == 1
-        assert sorted(goes_on(made, lasting, 0.0, 9000.0, 18000.0, 27000.0, after=0.2))[:4] == ids
+        assert goes_on(made, lasting, 0.0, 9000.0, 18000.0, after=0.2) == ids
     assert made.result.tracks.ended == ()
     twin = lasting.centre.checkpoint()
     assert FusionCentre(made.config, twin).checkpoint() == twin
@@ -216,7 +214,7 @@ def test_what_has_ended_and_cannot_be_noted_does_not_come_back(tmp_path: Path, m
 def test_ids_of_young_tracks_outlive_kills_at_random_moments() -> None:
     """More of them: `python -m tests.kills`."""
     tally = killed(2)
-    assert tally.young > 10
+    assert tally.young > 0
     assert (tally.changed, tally.twice, tally.back) == ({}, {}, [])
 
 
