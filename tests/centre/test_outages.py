@@ -33,16 +33,22 @@ class World:
         result = None
         for _ in range(seconds):
             self.second += 1
-            for number, name in enumerate(SOURCES):
-                states = seen(moved(self.truth, self.second), self.rng)
-                if name in speaking:
-                    ids = np.roll(np.arange(1, COUNT + 1), number)
-                    give(self.made, tracks(name, self.second, states, ids, epoch=self.epoch[name]))
+            give(self.made, *self.said(speaking))
             if steps:
                 result = step(self.made, self.second)
                 self.ended += [(track, why) for track, why, _ in result.tracks.ended]
                 self.events += result.log.events
         return result
+
+    def said(self, speaking: Collection[str]) -> list[Any]:
+        """What these sources say now."""
+        out = []
+        for number, name in enumerate(SOURCES):
+            states = seen(moved(self.truth, self.second), self.rng)
+            if name in speaking:
+                ids = np.roll(np.arange(1, COUNT + 1), number)
+                out.append(tracks(name, self.second, states, ids, epoch=self.epoch[name]))
+        return out
 
     def ids(self, result: StepResult | None) -> dict[int, int]:
         """{target: global id} of the last picture, of which each track must be one of the targets."""
@@ -249,3 +255,32 @@ def test_a_hundred_thousand_outages_do_not_grow(monkeypatch: pytest.MonkeyPatch)
     assert result.status.tracks["suspended"] == 8
     assert len(world.ended) == 4
     assert COASTING not in result.tracks.status
+
+
+@pytest.mark.parametrize("revise", [0.0, 100.0])
+@pytest.mark.parametrize("lost", [(), (3, 4, 5, 6, 7, 8, 9, 10)], ids=["all comes after all", "some of it does"])
+def test_what_comes_after_an_outage_of_what_was_said_in_it_gives_no_other_ids(
+    revise: float, lost: Collection[int]
+) -> None:
+    """The steps of the outage are made again with it: tracks that were suspended in them never were."""
+    world = World(lateness=20.0, revise=revise, stale_periods=1.0)
+    before = world.ids(world.go(10))
+    world.go(1, ())
+    for name in SOURCES:
+        world.made.handle(SourceLost(name), START)
+    kept = []
+    for ago in range(12):
+        world.second += 1
+        kept += [] if ago in lost else world.said(SOURCES)
+        result = step(world.made, world.second)
+        world.ended += [(track, why) for track, why, _ in result.tracks.ended]
+    assert result.status.tracks["suspended"] == COUNT
+    give(world.made, *kept)
+    seen_ids = set(before.values())
+    for _ in range(10):
+        result = world.go(1)  # type: ignore[assignment]
+        seen_ids |= set(result.tracks.ids.tolist())
+        assert "suspended" not in result.status.tracks
+    assert world.ids(result) == before
+    assert world.ended == []
+    assert seen_ids == set(before.values())
