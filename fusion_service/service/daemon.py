@@ -14,6 +14,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from fusion_service.bus import Bus, Inbox, open_bus
+from fusion_service.bus.security import check_party, maybe_security
 from fusion_service.centre import (
     ClockSet,
     Order,
@@ -49,6 +50,7 @@ from schemas import (
     encode,
     global_key,
     local_key,
+    order_key,
     parse_key,
 )
 
@@ -69,13 +71,16 @@ class Arrival(NamedTuple):
 
 
 def run_service(config: ServiceConfig, stop: threading.Event) -> None:
-    """Run until `stop` is set. Raises `BusError`, `StateError` or `ConfigError`, which says in one line why it
-    cannot start."""
+    """Run until `stop` is set. Raises `BusError`, `SecurityError`, `StateError` or `ConfigError`, which says in one
+    line why it cannot start."""
     try:
         begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
         raise ConfigError([f"[service] compiled: {error}"]) from None
-    with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop) as bus:
+    security = maybe_security(config.bus.security)
+    if security is not None:
+        check_party(security, ("centre",), config.centre.name)
+    with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop, security=security) as bus:
         Service(config, bus, state).run(stop)
 
 
@@ -140,6 +145,7 @@ class Service:
             bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
         bus.answer(global_key(name, "orders", realm), self._desk.answer)
+        bus.answer_each(order_key(name, "*", realm), lambda key, asked: self._desk.answer(asked, key.rsplit("/", 1)[1]))
         bus.announce(global_key(name, "alive", realm))
 
     def _wake_at(self, stop: threading.Event) -> None:
