@@ -17,7 +17,7 @@ DEAF = 2.0
 """Seconds of steps not made from which the centre was not there; less is a hiccup."""
 HELD = 60.0
 """Seconds up to which tracks are held over such a time; what was there before a longer one is no picture of now."""
-GRACE = 3_000_000_000
+GRACE = 10_000_000_000
 """ns after that in which sources may be found again."""
 
 
