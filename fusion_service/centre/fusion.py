@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among
+from fusion_service.arrays import among, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
 from fusion_service.centre.blobs import Blobs, Shared
@@ -74,7 +74,7 @@ class FusionCentre(Centre):
         self._supervisor.restore(state.get("supervision", {}))
         if "suspended" in state:
             self._suspended = Suspended.unpacked(state["suspended"], len(self.config.space))
-        self._ids.waiting = self._suspended.picture.id
+        self._note_waiting()
         self._last = self._time
 
     def _rebase(self, time: int) -> None:
@@ -124,9 +124,13 @@ class FusionCentre(Centre):
     def _forget(self, tracks: Iterable[int]) -> None:
         self._relink(dict.fromkeys(tracks, 0))
 
+    def _note_waiting(self) -> None:
+        self._ids.waiting = self._suspended.picture.id
+        self._intake.spared.awaited = frozenset(self._suspended.keys)
+
     def _stop_waiting(self, tracks: NDArray[np.uint64]) -> int:
         count = self._suspended.drop(tracks)
-        self._ids.waiting = self._suspended.picture.id
+        self._note_waiting()
         return count
 
     def _relink(self, new: dict[int, int]) -> None:
@@ -137,7 +141,7 @@ class FusionCentre(Centre):
         old = np.array(sorted(new), dtype=np.uint64)
         to = np.array([new[track] for track in old.tolist()], dtype=np.uint64)
         for source in self._intake.sources.values():
-            at = np.flatnonzero(among(source.tracks.link, old))
+            at = marked(among(source.tracks.link, old))
             if len(at):
                 link = to[np.searchsorted(old, source.tracks.link[at])]
                 double = among(link, np.delete(source.tracks.link, at))
@@ -182,7 +186,7 @@ class FusionCentre(Centre):
             lambda ids: self._suspended.held(rows, self._intake.names(), ids, self._intake),
         )  # fmt: skip
         self._suspended.take(picture.take(held), self._intake, self._journal)
-        self._ids.waiting = self._suspended.picture.id
+        self._note_waiting()
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
         tracks.link[among(tracks.link, picture.id[ended])] = NO_TRACK
         self._picture = picture.take(~ended)

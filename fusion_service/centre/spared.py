@@ -26,7 +26,8 @@ class Spared:
     source counts as one that has reported. newest: of which the newest step was told.
 
     awake: time of the step that was the first after the centre was not there, ns, -1: never. What was not heard before
-    it is no silence. gap: of the step that is made, ns for which the centre was not there before it.
+    it is no silence. gap: of the step that is made, ns for which the centre was not there before it. awaited: sources
+    that suspended tracks wait for.
     """
 
     def __init__(self, config: CentreConfig) -> None:
@@ -37,6 +38,7 @@ class Spared:
         self._slept = 0
         self.awake = -1
         self.gap = 0
+        self.awaited: frozenset[str] = frozenset()
 
     def sleep(self, event: object) -> None:
         """Steps before the next one are not made."""

@@ -204,7 +204,7 @@ class Suspended:
     def _forget(self, intake: Intake, time: int, journal: Journal) -> None:
         """End what was seen too long ago, and what no source of this run can bring back."""
         for name, keys in list(self.keys.items()):
-            source = intake.sources.get(name)
+            source = intake.sources.get(name) or intake.resting.get(name)
             if source is None or source.epoch != keys.epoch or not len(keys.id):
                 del self.keys[name]
         ids = self.picture.id
