@@ -14,6 +14,7 @@ from schemas.keys import (
     global_key,
     local_key,
     parse_key,
+    token_key,
     truth_key,
 )
 from schemas.messages import (
@@ -106,6 +107,7 @@ __all__ = [
     "pack_lower",
     "parse_key",
     "tracks_at",
+    "token_key",
     "truth_key",
     "unpack_lower",
 ]

@@ -12,7 +12,8 @@ from fusion_service.process import argument
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "The fusion service."
-EXAMPLE = "fusion-service run --config centre.toml"
+EXAMPLE = """fusion-service run --config centre.toml
+  fusion-service run --config centre.toml --standby           a second one, which takes over when the first is gone"""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -24,6 +25,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=argument(check_endpoint),
         metavar="ENDPOINT",
         help="hub to join, instead of the config's",
+    )
+    parser.add_argument(
+        "--standby",
+        action="store_true",
+        help="follow the centre of this name that runs, and take over when it is gone (same config, own state folder)",
     )
     parser.add_argument("--hub", action="store_true", help="hold a hub in this process too (the smallest installation)")
 
@@ -42,6 +48,6 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, connect=tuple(args.connect)))
     if args.hub:
         with open_bus(listen=config.bus.connect, mode="router"):
-            run_service(config, stop)
+            run_service(config, stop, args.standby)
     else:
-        run_service(config, stop)
+        run_service(config, stop, args.standby)

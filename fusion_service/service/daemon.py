@@ -11,9 +11,10 @@ import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
 from typing import NamedTuple
 
-from fusion_service.bus import Bus, Inbox, open_bus
+from fusion_service.bus import Bus, Inbox
 from fusion_service.centre import (
     ClockSet,
     Order,
@@ -34,6 +35,8 @@ from fusion_service.service.overload import Overload, overtaken
 from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker, status_line
 from fusion_service.service.stepping import LastingCentre
+from fusion_service.service.succession import succeed
+from fusion_service.service.tenure import Tenure
 from fusion_service.service.timing import StepTimes
 from fusion_service.service.tokens import Tokens
 from fusion_service.source_words import source_event
@@ -68,23 +71,24 @@ class Arrival(NamedTuple):
     received: int
 
 
-def run_service(config: ServiceConfig, stop: threading.Event) -> None:
-    """Run until `stop` is set. Raises `BusError`, `StateError` or `ConfigError`, which says in one line why it
-    cannot start."""
+def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = False) -> None:
+    """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `StateError` or `ConfigError`,
+    which says in one line why it cannot start."""
     try:
         begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
         raise ConfigError([f"[service] compiled: {error}"]) from None
-    with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop) as bus:
-        Service(config, bus, state).run(stop)
+    with open_state(config.service.state) as state:
+        succeed(config, state, stop, Service, standby)
 
 
 class Service:
-    """The service on an open bus, with its state."""
+    """The service on an open bus, with its state; tenure: its hold of the centre's name."""
 
-    def __init__(self, config: ServiceConfig, bus: Bus, state: State) -> None:
+    def __init__(self, config: ServiceConfig, bus: Bus, state: State, tenure: Tenure | None = None) -> None:
         self._config = config
         self._bus = bus
+        self._tenure = tenure or Tenure(config, bus)
         self._inbox: Inbox[Arrival | Order] = Inbox(config.bus.queue)
         self._status = StatusMaker(config.centre.name)
         self._counts = self._status.counts
@@ -99,17 +103,25 @@ class Service:
         self._taken = 0
         """When everything that had come was taken from the inbox, ns."""
 
-    def run(self, stop: threading.Event) -> None:
-        """Work until `stop` is set."""
+    def feed(self, source: str, key: str, data: bytes, received: int) -> None:
+        """Take a sample as if it came now: of one that stood by."""
+        self._inbox.put(source, Arrival(key, data, received), len(data))
+
+    def run(self, stop: threading.Event, begun: Callable[[], None] | None = None) -> None:
+        """Work until `stop` is set, or another holds the centre's name. begun: called when all is declared."""
+        self._tenure.begin(self._lasting.generation, self._lasting.centre.epoch, self._inbox.wake)
         self._declare()
+        if begun is not None:
+            begun()
+            self._times.resume(self._lasting.centre.time, time.time_ns())
         threading.Thread(target=self._wake_at, args=(stop,), daemon=True).start()
         notify("READY=1")
         centre = self._config.centre
         rule = centre.rule if centre.kind == "tracks" else f"{centre.intensity_rule} of intensities"
         log.info("fusing by %s, memory %s, every %g s as %s", rule, centre.memory, centre.period, centre.name)
         status_due = time.monotonic() + self._config.service.status_period
-        while not stop.is_set():
-            timeout = max(0.0, status_due - time.monotonic())
+        while self._tenure.goes_on(self._lasting.centre, stop) and not stop.is_set():
+            timeout = min(max(0.0, status_due - time.monotonic()), self._tenure.pace)
             for item in self._take(min(timeout, self._times.wait(time.time_ns()))):
                 if stop.is_set():
                     break
@@ -121,8 +133,11 @@ class Service:
             if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= status_due:
                 status_due = time.monotonic() + self._config.service.status_period
                 notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
-        notify("STOPPING=1")
         self._lasting.save(at_once=True)
+        if not stop.is_set():
+            log.warning("stands down: %s", self._tenure.farewell)
+            return
+        notify("STOPPING=1")
         self._publish_status()
         log.info("stopped after %d steps", self._counts["steps"])
 
@@ -247,7 +262,8 @@ class Service:
         if made is None:
             return
         for what, payload in made.messages.items():
-            self._out[what].put(payload)
+            self._put(what, payload)
+        self._tenure.stepped(made.result.log.step, at, self._lasting.centre.epoch, self._lasting.generation)
         self._status.published(at, time.time_ns())
         notes = made.result.status.notes
         if notes and self._told.allows(notes[0], 600.0):
@@ -256,6 +272,11 @@ class Service:
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
+
+    def _put(self, what: str, payload: bytes) -> None:
+        """Publish it, if this process is still the one that does."""
+        if self._tenure.may_publish():
+            self._out[what].put(payload)
 
     def _tell_sources(self, journal: StepLog) -> None:
         """Say what has changed about sources: how they are trusted, shifted, used: twenty lines a second at most."""
@@ -282,8 +303,9 @@ class Service:
             alive=self._tokens.told,
             skipped=self._times.skipped,
             overload=None if self._overload.since is None else time.monotonic() - self._overload.since,
+            tenure=self._tenure,
         )
         if self._overload.since is not None and status.notes:
             self._told.warn("%s", status.notes[0])
-        self._out["status"].put(encode(status))
+        self._put("status", encode(status))
         return status

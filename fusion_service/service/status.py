@@ -10,6 +10,7 @@ from typing import Any
 
 from fusion_service.bus import Inbox
 from fusion_service.compiled import road
+from fusion_service.service.tenure import Tenure
 from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
@@ -57,9 +58,11 @@ class StatusMaker:
         alive: Mapping[str, bool],
         skipped: int,
         overload: float | None = None,
+        tenure: Tenure | None = None,
     ) -> Status:
         """The status now. last: the centre's own, of its newest step; refused: by reason; alive: whether each source is
-        there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not."""
+        there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not.
+        tenure: the process' hold of the centre's name."""
         uptime = time.monotonic() - self._started
         counts, now = self.counts, time.time_ns()
         recent, span = counts - self._before, max(uptime - self._before_at, 1e-3)
@@ -101,12 +104,16 @@ class StatusMaker:
             },
             road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            notes=self._notes(last, skipped, overload),
+            notes=self._notes(last, skipped, overload, tenure.notes() if tenure is not None else ()),
+            term=tenure.term if tenure is not None else None,
+            standby=tenure.numbers() if tenure is not None else None,
         )
 
-    def _notes(self, last: Status | None, skipped: int, overload: float | None) -> tuple[str, ...] | None:
-        """The centre's notes, after what the process has to say."""
-        said = last.notes if last is not None else None
+    def _notes(
+        self, last: Status | None, skipped: int, overload: float | None, more: tuple[str, ...]
+    ) -> tuple[str, ...] | None:
+        """The centre's notes, after what the process has to say, and `more`."""
+        said = (*more, *((last.notes if last is not None else None) or ())) or None
         if overload is None:
             return said
         behind = "" if self._latency is None else f", and the picture is {self._latency:.2f} s old when it goes out"

@@ -75,7 +75,7 @@ class LastingCentre:
         desk.follow(self.centre)
 
     def _make_centre(self) -> Centre:
-        epoch = time.time_ns()
+        epoch = max(time.time_ns(), self._state.epoch_above + 1)
         if self._checkpoint is not None:
             self._checkpoint, self._ended = without(self._config, self._checkpoint, np.concatenate(self._ended)), [NONE]
         centre, fault = make_centre(self._config, self._checkpoint, generation=self._generation, epoch=epoch)
@@ -103,6 +103,11 @@ class LastingCentre:
             made = again
         self._desk.follow(self.centre)
         return made
+
+    @property
+    def generation(self) -> int:
+        """The upper half of the ids that are given now."""
+        return self._generation
 
     def save(self, *, at_once: bool = False) -> None:
         """Save what has changed, where that is due."""

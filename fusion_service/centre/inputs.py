@@ -1,4 +1,4 @@
-"""Recorded inputs that a step log may still name, by their digest.
+"""Inputs that a step log may still name, by their digest: of a recording, or of a centre that another one follows.
 
 A log comes after what it took, so that little has to be held: a message goes when a log has named it, or when it is too
 old for any step to take. But the last few of each source and kind stay, since a source sends them again to a service
@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fusion_service.centre import source_of
+from fusion_service.centre.pictures import source_of
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, StepLog
 
 __all__ = ["Input", "InputBuffer", "LocalMessage"]
@@ -31,12 +31,15 @@ LocalMessage = LocalTracks | LocalIntensity | SensorInfo | GlobalTracks
 
 @dataclass(slots=True)
 class Input:
-    """A message that a step may take; received, ns; size of it, bytes; named: whether a log has named it."""
+    """A message that a step may take; received, ns; size of it, bytes; named: whether a log has named it; key: on
+    which it came, and data: its bytes, where they are to be handed on."""
 
     message: LocalMessage
     received: int
     size: int
     named: bool = False
+    key: str = ""
+    data: bytes = b""
 
 
 class InputBuffer:

@@ -1,0 +1,72 @@
+"""Which part a process has in its centre: active, or standing by for the one that is; and what follows when it ends.
+
+One that starts while another of its name is active stands by, whatever it was started as; one that stood down does so
+too. Every part has a session of its own on the bus, so that with it everything ends that was declared.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Protocol
+
+from fusion_service.bus import Bus, open_bus
+from fusion_service.config import ServiceConfig
+from fusion_service.service.standby import Standby
+from fusion_service.service.state import State
+from fusion_service.service.tenure import Tenure
+
+__all__ = ["Active", "succeed"]
+
+log = logging.getLogger(__name__)
+
+
+class Active(Protocol):
+    """The service, as the part that is active."""
+
+    def run(self, stop: threading.Event, begun: Callable[[], None] | None = None) -> None: ...
+
+    def feed(self, source: str, key: str, data: bytes, received: int) -> None: ...
+
+
+def succeed(
+    config: ServiceConfig,
+    state: State,
+    stop: threading.Event,
+    make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
+    standby: bool,
+) -> None:
+    """Run as what the process is, one part after the other, until `stop` is set. make: the service on an open bus.
+    Raises what `open_bus` and `make` do."""
+    while not stop.is_set():
+        with ExitStack() as stack:
+            waiting: Standby | None = None
+            why = ""
+            if standby:
+                heard = stack.enter_context(ExitStack())
+                waiting = Standby(config, heard.enter_context(open_bus(config.bus.connect, stop=stop)), state)
+                heritage = waiting.wait(stop)
+                if heritage is None:
+                    return
+                state.inherit(heritage.checkpoint, heritage.ended, heritage.generation, heritage.epoch)
+                why = f"took over: {heritage.why}"
+            bus = stack.enter_context(open_bus(config.bus.connect, stop=stop))
+            tenure = Tenure(config, bus, why)
+            standby = True
+            if waiting is None and (terms := tenure.others()):
+                log.warning("a centre named %s is active, term %d: standing by for it", config.centre.name, terms[-1])
+                continue
+            service = make(config, bus, state, tenure)
+            service.run(stop, _hand_on(waiting, service, heard) if waiting is not None else None)
+
+
+def _hand_on(waiting: Standby, service: Active, heard: ExitStack) -> Callable[[], None]:
+    """Gives the service that has begun what waits for it, and ends the session on which that was heard."""
+
+    def begun() -> None:
+        waiting.hand_on(lambda source, one: service.feed(source, one.key, one.data, one.received))
+        heard.close()
+
+    return begun
