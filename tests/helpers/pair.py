@@ -126,7 +126,8 @@ class Pair:
 
     def active(self) -> int:
         """Which of the two is active, by the parity of its term's node: they are 0 and 1."""
-        assert self.watch.status is not None and self.watch.status.term is not None
+        assert self.watch.status is not None
+        assert self.watch.status.term is not None
         return self.watch.status.term % 4
 
     def taken_over(self, since: int, timeout: float = 10.0) -> Seen:
