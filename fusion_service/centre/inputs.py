@@ -20,6 +20,7 @@ SENT_AGAIN = 8
 """Messages of a source and kind that its publisher sends to who comes later."""
 MOST_BYTES = 256 * 2**20
 MOST_INPUTS = 200_000
+MOST_NAMES = 10_000
 SWEEP = 64
 """Logs between two looks for what is too old."""
 MARGIN = 60.0
@@ -62,6 +63,8 @@ class InputBuffer:
         self._inputs[code] = one
         self._bytes += one.size
         recent = self._recent.setdefault((source_of(one.message), one.message.type), deque())
+        if len(self._recent) > MOST_NAMES:
+            del self._recent[next(iter(self._recent))]
         recent.append(code)
         if len(recent) > SENT_AGAIN:
             old = recent.popleft()
@@ -112,7 +115,7 @@ class InputBuffer:
 
     def _name(self, code: int, one: Input) -> None:
         one.named = True
-        if code not in self._recent[source_of(one.message), one.message.type]:
+        if code not in self._recent.get((source_of(one.message), one.message.type), ()):
             self._drop(code)
 
     def _drop(self, code: int) -> None:

@@ -1,9 +1,11 @@
 """The state of the active centre, held by another process: a checkpoint of it, and every step since as its log says.
 
 A step log names what the step took; the messages came here too, so the same step is made of them. What comes of it is
-compared with the picture that the active centre published. Where a message is missing, a step failed or came out other,
-or the settings differ, nothing more is made: `wanted` says why a new checkpoint is needed. Until it is there, the last
-one is what this process would go on from, without the tracks that have ended since, as a service does that was killed.
+compared with the picture that the active centre published. Where a message is missing, a step failed or gave other
+tracks, or the settings differ, nothing more is made: `wanted` says why a new checkpoint is needed. Until it is there,
+the last one is what this process would go on from, without the tracks that have ended since, as a service does that was
+killed. Where the same tracks have other numbers, it goes on, and takes a new checkpoint when it may: a checkpoint does
+not tell what came before it, so that data that were late for steps before it change the active centre's alone.
 """
 
 from __future__ import annotations
@@ -20,10 +22,12 @@ from fusion_service.centre.retracing import events_of, step_again
 from fusion_service.config import CentreConfig
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, digest
 
-__all__ = ["Mark", "Shadow", "alike"]
+__all__ = ["Mark", "Shadow", "same_numbers", "same_tracks"]
 
 PATIENCE = 0.5
 """Seconds for which a step waits for the messages that it took, and for the log of the one before it."""
+LEISURE = 10.0
+"""Seconds, and four times `lateness`, for which numbers may differ before a new checkpoint is taken."""
 MOST = 256
 """Logs, and pictures, that wait."""
 NEAR = 1e-6
@@ -60,7 +64,17 @@ class Shadow:
         self.newest: Mark = (-1, -1)
         """The newest step that a log or picture was heard of."""
         self.wanted = "it has none yet"
+        self._loaded = 0.0
+        self._off = False
+        self.off = 0
+        """Steps whose numbers differed."""
         self.steps = self.fetched = 0
+
+    @property
+    def lacks(self) -> bool:
+        """Whether a new checkpoint should be taken now."""
+        leisure = max(LEISURE, 4 * self._config.lateness)
+        return bool(self.wanted) or (self._off and self._now() - self._loaded > leisure)
 
     @property
     def ready(self) -> bool:
@@ -73,7 +87,7 @@ class Shadow:
         if fault:
             return fault
         self._centre, self._kept, self.mark, self.wanted = centre, Kept(blob, mark), mark, ""
-        self.fetched += 1
+        self.fetched, self._loaded, self._off = self.fetched + 1, self._now(), False
         self._made.clear()
         for _, (log, _) in sorted(self._logs.items()):
             if (log.epoch, log.step) <= mark:
@@ -154,8 +168,12 @@ class Shadow:
 
     def _check(self, mark: Mark, published: GlobalTracks) -> None:
         made = self._made.pop(mark, None)
-        if made is not None and not self.wanted and not alike(made, published):
-            self.wanted = f"step {mark[1]} came out other than the active centre's"
+        if made is None or self.wanted:
+            return
+        if not same_tracks(made, published):
+            self.wanted = f"step {mark[1]} gave other tracks than the active centre's"
+        elif not same_numbers(made, published):
+            self._off, self.off = True, self.off + 1
 
     def heritage(self) -> tuple[bytes | None, NDArray[np.uint64]]:
         """What to go on from: a checkpoint, None where there is none, and the tracks that have ended since."""
@@ -174,20 +192,21 @@ class Shadow:
         return [(source_of(one.message), one) for one in inputs if one.received >= since]
 
 
-def alike(made: GlobalTracks, published: GlobalTracks) -> bool:
-    """Whether a whole picture is the one that was published, of which a delta says a part: the same tracks, in the same
-    places as far as two machines compute alike."""
-    at = np.searchsorted(made.ids, published.ids)
-    if len(published.ids) and (at >= len(made.ids)).any():
-        return False
-    if not published.delta and len(made.ids) != len(published.ids):
-        return False
-    same = np.array_equal(made.ids[at], published.ids) and np.array_equal(made.status[at], published.status)
-    if not same or made.space != published.space or made.frame != published.frame:
+def same_tracks(made: GlobalTracks, published: GlobalTracks) -> bool:
+    """Whether a whole picture has the tracks of the one that was published, of which a delta says a part."""
+    ids = made.ids[np.isin(made.ids, published.ids)] if published.delta else made.ids
+    return np.array_equal(ids, published.ids) and made.space == published.space and made.frame == published.frame
+
+
+def same_numbers(made: GlobalTracks, published: GlobalTracks) -> bool:
+    """Whether pictures of the same tracks say the same of them, as far as two machines compute alike. Of mixtures in a
+    delta only the status is compared."""
+    listed = np.isin(made.ids, published.ids)
+    if not np.array_equal(made.status[listed], published.status):
         return False
     means = made.means
-    if made.counts is None and published.counts is None:
-        means = means[at]
-    elif published.delta:
-        return True
+    if published.delta:
+        if made.counts is not None or published.counts is not None:
+            return True
+        means = means[listed]
     return means.shape == published.means.shape and np.allclose(means, published.means, rtol=NEAR, atol=NEAR)

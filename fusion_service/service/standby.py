@@ -32,7 +32,7 @@ from fusion_service.service.notify import notify
 from fusion_service.service.shadow import Shadow
 from fusion_service.service.state import State
 from fusion_service.service.tenure import seconds, terms_held
-from fusion_service.service.terms import free_node, node_of
+from fusion_service.service.terms import MOST_GENERATION, free_node, node_of
 from schemas import centre_source, decode, global_key, local_key, token_key
 
 __all__ = ["Standby", "Succession"]
@@ -45,16 +45,15 @@ ALONE = 2.0
 YIELDED = 0.3
 """Seconds for which the last log of one that hands over is waited for."""
 ROUND = 0.02
-SPACING = 1.0
-"""Seconds between two checkpoints that are asked for."""
+SPACING, SHARE = 0.25, 10.0
+"""Seconds between two checkpoints that are asked for, and so many times what the last one took."""
 FETCH = 5.0
 """Seconds for one to come."""
 HUNG = 5.0
 """Seconds, and periods, without a round of the active one's loop after which it is as good as gone."""
 KEPT = 10.0
-SLOT = 2**20
-MOST_GENERATION = 2**32 - 2**16
 MOST_EPOCH = 2**63 - 2**32
+MOST = 100
 
 log = logging.getLogger(__name__)
 
@@ -90,7 +89,7 @@ class Standby:
         self._config, self._bus, self._state = config, bus, state
         self._takeover = config.service.takeover
         self._shadow = Shadow(config.centre, seconds)
-        self._inbox: Inbox[Sample | Loaded] = Inbox(config.bus.queue, slot_bytes=SLOT)
+        self._inbox: Inbox[Sample | Loaded] = Inbox(config.bus.queue)
         self._told = BoundedLog(1.0)
         self._name = f"{time.time_ns():x}"
         self._lock = threading.Lock()
@@ -165,7 +164,7 @@ class Standby:
     def _on_term(self, key: str, alive: bool) -> None:
         with self._lock:
             for term in terms_held([key]):
-                if alive and len(self._holding) < 100:
+                if alive and len(self._holding) < MOST:
                     self._holding[term] = self._sign = seconds()
                     self._met = True
                 elif not alive and term in self._holding:
@@ -175,10 +174,10 @@ class Standby:
 
     def _on_yield(self, key: str, alive: bool) -> None:
         term, _, step = key.rsplit("/", 1)[-1].partition(".")
-        if term.isdigit() and step.isdigit():
+        if len(step) < 19 and step.isascii() and step.isdigit() and terms_held([term]):
             with self._lock:
                 self._yielded.pop(int(term), None)
-                if alive and len(self._yielded) < 100:
+                if alive and len(self._yielded) < MOST:
                     self._yielded[int(term)] = int(step), seconds()
             self._inbox.wake()
 
@@ -188,9 +187,9 @@ class Standby:
         while not (stop.is_set() or self._over.is_set()):
             begin = seconds()
             self._ask_once({"what": "sign"})
-            if self._shadow.wanted and self._holding and begin - self._fetched > SPACING:
-                self._fetched = begin
+            if self._shadow.lacks and self._holding and begin > self._fetched:
                 self._fetch(stop)
+                self._fetched = seconds() + max(SPACING, SHARE * (seconds() - begin))
             self._over.wait(max(0.0, begin + self._takeover / 4 - seconds()))
 
     def _ask_once(self, request: dict[str, Any]) -> dict[str, Any]:
@@ -205,8 +204,8 @@ class Standby:
             answers = [msgpack.unpackb(data) for _, data in self._bus.ask(key, payload, max(self._takeover, 0.5))]
         except (BusError, ValueError):
             return {}
-        sound = [one for one in answers if isinstance(one, dict) and type(one.get("term")) is int]
-        answer: dict[str, Any] = max(sound, key=lambda one: one["term"], default={})
+        sound = [one for one in answers if isinstance(one, dict) and terms_held([str(one.get("term"))])]
+        answer: dict[str, Any] = max(sound, key=lambda one: int(one["term"]), default={})
         if answer:
             self._heard(answer)
         return answer
@@ -216,8 +215,9 @@ class Standby:
         with self._lock:
             self._sign, self._met = seconds(), True
             self._age = float(age) if isinstance(age, (int, float)) else 0.0
-            self._nodes = nodes if isinstance(nodes, dict) else {}
-            self._following = answer["term"]
+            said = list(nodes.items())[:MOST] if isinstance(nodes, dict) else []
+            self._nodes = {str(name): node for name, node in said if type(node) is int}
+            self._following = int(answer["term"])
             if isinstance(generation, int) and isinstance(epoch, int):
                 self._generation = max(self._generation, min(generation, MOST_GENERATION))
                 self._epoch = max(self._epoch, min(epoch, MOST_EPOCH))
@@ -328,7 +328,7 @@ class Standby:
     def _settle_node(self) -> None:
         """Take a node of its own beside those that are known."""
         others = [node_of(term) for term in self._holding]
-        others += [node for name, node in self._nodes.items() if name < self._name and type(node) is int]
+        others += [node for name, node in self._nodes.items() if name < self._name]
         node = free_node(self._state.node, others)
         if (node != self._state.node or not self._state.has_node) and self._holding:
             try:

@@ -24,6 +24,7 @@ import msgpack
 
 from fusion_service.bus import Bus
 from fusion_service.config import ServiceConfig
+from fusion_service.service.terms import MOST_GENERATION
 from schemas import global_key, token_key
 
 __all__ = ["PART", "Held", "Tenure", "seconds", "terms_held"]
@@ -33,6 +34,8 @@ PART = 2**20
 HANDOVER = 2.0
 ASKED = 1.0
 """Seconds that the hub has for its answer."""
+OFTEN = 0.05
+"""Seconds after one look until the next."""
 FRESH = 2.0
 """Seconds for which one that stands by is there after it was heard."""
 MOST = 8
@@ -49,7 +52,9 @@ def seconds() -> float:
 
 def terms_held(keys: list[str]) -> list[int]:
     """The terms that tokens tell, the greatest last."""
-    return sorted(int(name) for key in keys if (name := key.rsplit("/", 1)[-1]).isascii() and name.isdigit())
+    names = [key.rsplit("/", 1)[-1] for key in keys]
+    terms = [int(name) for name in names if len(name) <= 10 and name.isascii() and name.isdigit()]
+    return sorted(term for term in terms if term < MOST_GENERATION)
 
 
 class Held(NamedTuple):
@@ -234,9 +239,11 @@ class Tenure:
     def may_publish(self) -> bool:
         """Look, before anything is published, whether the name is still this process' own."""
         now = seconds()
+        if now - self._passed < OFTEN:
+            return not self._doubt and not self._newer
         patience = min([self._takeover, *(one.takeover for one in list(self._followers.values()))])
-        connected = self._bus.connected
         late = now - self._passed > patience / 2
+        connected = self._bus.connected if late or self._accompanied else True
         if (late and connected) or (self._accompanied and not connected):
             self._doubt = True
         if self._doubt and not self._newer:

@@ -10,9 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-__all__ = ["NODES", "free_node", "generation_after", "node_of"]
+__all__ = ["MOST_GENERATION", "NODES", "free_node", "generation_after", "node_of"]
 
 NODES = 4
+MOST_GENERATION = 2**32 - 2**16
+"""What is said to be above is not believed: there would be none left."""
 
 
 def generation_after(last: int, node: int, seconds: int) -> int:
