@@ -99,7 +99,7 @@ class Standby:
         self._holding: dict[int, float] = {}
         """Terms under which the name is held, and since when, s, this is known."""
         self._yielded: dict[int, tuple[int, float]] = {}
-        self._none_since = now
+        self._begun = self._none_since = now
         self._sign = now
         self._age = 0.0
         self._away = -REJOINED
@@ -269,7 +269,7 @@ class Standby:
         if self._told.allows("watchdog", 0.5):
             where = f"at step {shadow.mark[1]}" if not shadow.wanted else shadow.wanted
             notify(f"WATCHDOG=1\nSTATUS=standing by: {where}")
-        if not self._met and self._told.allows("nobody", 30.0):
+        if not self._met and now - self._begun > ALONE and self._told.allows("nobody", 30.0):
             log.warning("nobody is active as %s: waiting for one (`fusion-service run`)", self._config.centre.name)
         if shadow.ready and not shadow.wanted and now - self._saved > KEPT:
             self._saved = now

@@ -82,7 +82,11 @@ def main() -> None:
         stack.callback(hub.kill)
         mission = Mission(hub, Path(folder), stack, args.frozen)
         for what in args.what:
-            rows = [mission.once(what) for _ in range(args.times)]
+            try:
+                rows = [mission.once(what) for _ in range(args.times)]
+            except AssertionError:
+                print(*(one.told() for one in mission.pair.programs if one is not None), sep="\n--\n")
+                raise
             took, gaps, changed = zip(*rows, strict=True)
             print(
                 f"{what:9} {len(rows):4} times: picture of the other after {statistics.median(took):.2f} s (median), "
