@@ -213,7 +213,8 @@ class Bus:
 
     def present(self, key_expression: str, timeout: float = 1.0) -> tuple[list[str], bool]:
         """The tokens there are now, and whether the hub was there to say so. Waits for it up to `timeout` seconds: not
-        for use in a callback."""
+        for use in a callback, nor on a session that watches such keys, which asks nobody but answers from what it has
+        heard."""
         there = self.connected
         with _readable(key_expression):
             replies = list(self._session.liveliness().get(key_expression, timeout=timeout))

@@ -83,10 +83,11 @@ class Loaded(NamedTuple):
 
 
 class Standby:
-    """Stands by on `bus`. state: the process' own, where its node, and now and then what it holds, is kept."""
+    """Stands by on `bus`. probe: a session that watches nothing. state: the process' own, where its node, and now and
+    then what it holds, is kept."""
 
-    def __init__(self, config: ServiceConfig, bus: Bus, state: State) -> None:
-        self._config, self._bus, self._state = config, bus, state
+    def __init__(self, config: ServiceConfig, bus: Bus, probe: Bus, state: State) -> None:
+        self._config, self._bus, self._probe, self._state = config, bus, probe, state
         self._takeover = config.service.takeover
         self._shadow = Shadow(config.centre, seconds)
         self._inbox: Inbox[Sample | Loaded] = Inbox(config.bus.queue)
@@ -316,7 +317,7 @@ class Standby:
 
     def _is_so(self, why: str) -> bool:
         """Whether the hub, asked now, does not say otherwise."""
-        keys, answered = self._bus.present(
+        keys, answered = self._probe.present(
             token_key(self._config.centre.name, "holds", "*", self._config.bus.realm), self._takeover / 2
         )
         held = terms_held(keys)

@@ -1,7 +1,8 @@
 """Which part a process has in its centre: active, or standing by for the one that is; and what follows when it ends.
 
 One that starts while another of its name is active stands by, whatever it was started as; one that stood down does so
-too. Every part has a session of its own on the bus, so that with it everything ends that was declared.
+too. Every part has a session of its own on the bus, so that with it everything ends that was declared; another one, on
+which nothing is watched, is there all the time to ask the hub who is active.
 """
 
 from __future__ import annotations
@@ -16,7 +17,8 @@ from fusion_service.bus import Bus, open_bus
 from fusion_service.config import ServiceConfig
 from fusion_service.service.standby import Standby
 from fusion_service.service.state import State
-from fusion_service.service.tenure import Tenure
+from fusion_service.service.tenure import Tenure, terms_held
+from schemas import token_key
 
 __all__ = ["Active", "succeed"]
 
@@ -40,26 +42,39 @@ def succeed(
 ) -> None:
     """Run as what the process is, one part after the other, until `stop` is set. make: the service on an open bus.
     Raises what `open_bus` and `make` do."""
-    while not stop.is_set():
-        with ExitStack() as stack:
-            waiting: Standby | None = None
-            why = ""
-            if standby:
-                heard = stack.enter_context(ExitStack())
-                waiting = Standby(config, heard.enter_context(open_bus(config.bus.connect, stop=stop)), state)
-                heritage = waiting.wait(stop)
-                if heritage is None:
-                    return
-                state.inherit(heritage.checkpoint, heritage.ended, heritage.generation, heritage.epoch)
-                why = f"took over: {heritage.why}"
-            bus = stack.enter_context(open_bus(config.bus.connect, stop=stop))
-            tenure = Tenure(config, bus, why)
-            standby = True
-            if waiting is None and (terms := tenure.others()):
-                log.warning("a centre named %s is active, term %d: standing by for it", config.centre.name, terms[-1])
-                continue
-            service = make(config, bus, state, tenure)
-            service.run(stop, _hand_on(waiting, service, heard) if waiting is not None else None)
+    with open_bus(config.bus.connect, stop=stop) as probe:
+        while not stop.is_set():
+            standby = _part(config, state, stop, make, standby, probe)
+
+
+def _part(
+    config: ServiceConfig,
+    state: State,
+    stop: threading.Event,
+    make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
+    standby: bool,
+    probe: Bus,
+) -> bool:
+    """Be one part until it ends; whether the next is to stand by."""
+    holds = token_key(config.centre.name, "holds", "*", config.bus.realm)
+    if not standby and (terms := terms_held(probe.present(holds)[0])):
+        log.warning("a centre named %s is active, term %d: standing by for it", config.centre.name, terms[-1])
+        return True
+    with ExitStack() as stack:
+        waiting: Standby | None = None
+        why = ""
+        if standby:
+            heard = stack.enter_context(ExitStack())
+            waiting = Standby(config, heard.enter_context(open_bus(config.bus.connect, stop=stop)), probe, state)
+            heritage = waiting.wait(stop)
+            if heritage is None:
+                return True
+            state.inherit(heritage.checkpoint, heritage.ended, heritage.generation, heritage.epoch)
+            why = f"took over: {heritage.why}"
+        bus = stack.enter_context(open_bus(config.bus.connect, stop=stop))
+        service = make(config, bus, state, Tenure(config, bus, probe, why))
+        service.run(stop, _hand_on(waiting, service, heard) if waiting is not None else None)
+    return True
 
 
 def _hand_on(waiting: Standby, service: Active, heard: ExitStack) -> Callable[[], None]:

@@ -3,7 +3,8 @@
 A token `holds/{term}` says under which term it is active; who sees one of a greater term stands down. Nothing is
 published before that was looked at: whoever has not come by for `takeover / 2` seconds (it was frozen, or a step took
 long), or has lost the hub while another stands by, asks the hub for the tokens first, and publishes nothing until the
-hub has answered. Clocks that go on while a machine sleeps tell.
+hub has told them, its own among them, and within that time. Clocks that go on while a machine sleeps tell. The hub is
+asked on a session that watches no tokens: one that does would answer from what it heard before it was frozen.
 
 Those who stand by ask `.../state`: for a sign of life, with which they say how far they have come; for a checkpoint, a
 part at a time, which is made between two steps; or, for an operator, to hand over: then the last step is published,
@@ -32,10 +33,10 @@ __all__ = ["PART", "Held", "Tenure", "seconds", "terms_held"]
 PART = 2**20
 """Bytes of a checkpoint in one answer."""
 HANDOVER = 2.0
-ASKED = 1.0
-"""Seconds that the hub has for its answer."""
 OFTEN = 0.05
 """Seconds after one look until the next."""
+LOOK = 2.0
+"""Seconds after which the hub is asked in any case, where another stands by."""
 FRESH = 2.0
 """Seconds for which one that stands by is there after it was heard."""
 MOST = 8
@@ -87,12 +88,11 @@ class Follower:
 
 
 class Tenure:
-    """The active process' hold of a centre's name on `bus`. wake: lets the loop come by at once.
+    """The active process' hold of a centre's name on `bus`. probe: a session that watches nothing; without it the hub
+    is not asked. why: how it came to be active, for the status. handed: whether it ended by an order."""
 
-    handed: whether it ended by an order."""
-
-    def __init__(self, config: ServiceConfig, bus: Bus, why: str = "") -> None:
-        self._realm, self._name, self._bus = config.bus.realm, config.centre.name, bus
+    def __init__(self, config: ServiceConfig, bus: Bus, probe: Bus | None = None, why: str = "") -> None:
+        self._realm, self._name, self._bus, self._probe = config.bus.realm, config.centre.name, bus, probe
         self._takeover = config.service.takeover
         self._lock = threading.Lock()
         self._wake: Callable[[], None] = lambda: None
@@ -103,7 +103,7 @@ class Tenure:
         self._newer = 0
         self._lower: set[int] = set()
         self._doubt = self._accompanied = self._handing = False
-        self._passed = seconds()
+        self._passed = self._asked = seconds()
         self._step = self._time = -1
         self._epoch = self._generation = 0
         self._said: tuple[str, float] = (why, seconds())
@@ -115,12 +115,8 @@ class Tenure:
         """Seconds after which the loop should come by again."""
         return self._takeover / 4
 
-    def others(self) -> list[int]:
-        """The terms under which this name is held now. Waits for the hub's answer."""
-        return terms_held(self._bus.present(self._key("holds", "*"), ASKED)[0])
-
     def begin(self, term: int, epoch: int, wake: Callable[[], None]) -> None:
-        """Hold the name from now on."""
+        """Hold the name from now on. wake: lets the loop come by at once."""
         self.term = self._generation = term
         self._epoch, self._wake = epoch, wake
         self._bus.announce(self._key("holds", str(term)))
@@ -240,18 +236,20 @@ class Tenure:
         """Look, before anything is published, whether the name is still this process' own."""
         now = seconds()
         if now - self._passed < OFTEN:
-            return not self._doubt and not self._newer
+            return not (self._doubt and self._probe is not None) and not self._newer
         patience = min([self._takeover, *(one.takeover for one in list(self._followers.values()))])
         late = now - self._passed > patience / 2
         connected = self._bus.connected if late or self._accompanied else True
-        if (late and connected) or (self._accompanied and not connected):
+        due = self._accompanied and now - self._asked > LOOK
+        if (late and connected) or (self._accompanied and not connected) or due:
             self._doubt = True
-        if self._doubt and not self._newer:
-            keys, answered = self._bus.present(self._key("holds", "*"), ASKED / 2)
-            self._newer = max([0, *(term for term in terms_held(keys) if term > self.term)])
-            self._doubt = not answered
+        if self._doubt and self._probe is not None and not self._newer:
+            keys, answered = self._probe.present(self._key("holds", "*"), patience / 2)
+            self._asked, terms = seconds(), terms_held(keys)
+            self._newer = max([self._newer, *(term for term in terms if term > self.term)])
+            self._doubt = not answered or self.term not in terms or seconds() - now > patience / 2
         self._passed = seconds()
-        return not self._doubt and not self._newer
+        return not (self._doubt and self._probe is not None) and not self._newer
 
     def _gone(self) -> bool:
         """Whether another holds the name."""
