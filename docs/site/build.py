@@ -31,6 +31,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "standby",
             "arrival",
             "judgement",
             "supervision",

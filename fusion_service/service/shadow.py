@@ -64,7 +64,8 @@ class Shadow:
         self.newest: Mark = (-1, -1)
         """The newest step that a log or picture was heard of."""
         self.wanted = "it has none yet"
-        self._loaded = 0.0
+        self.loaded = float("-inf")
+        """When a checkpoint was taken, s."""
         self._off = False
         self.off = 0
         """Steps whose numbers differed."""
@@ -74,7 +75,7 @@ class Shadow:
     def lacks(self) -> bool:
         """Whether a new checkpoint should be taken now."""
         leisure = max(LEISURE, 4 * self._config.lateness)
-        return bool(self.wanted) or (self._off and self._now() - self._loaded > leisure)
+        return bool(self.wanted) or (self._off and self._now() - self.loaded > leisure)
 
     @property
     def ready(self) -> bool:
@@ -87,7 +88,7 @@ class Shadow:
         if fault:
             return fault
         self._centre, self._kept, self.mark, self.wanted = centre, Kept(blob, mark), mark, ""
-        self.fetched, self._loaded, self._off = self.fetched + 1, self._now(), False
+        self.fetched, self.loaded, self._off = self.fetched + 1, self._now(), False
         self._made.clear()
         for _, (log, _) in sorted(self._logs.items()):
             if (log.epoch, log.step) <= mark:

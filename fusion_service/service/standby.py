@@ -17,7 +17,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
 from typing import Any, NamedTuple
 
 import msgpack
@@ -42,8 +41,10 @@ RANK = 0.5
 REJOINED = 3.0
 ALONE = 2.0
 """Seconds without any token after the start, before one that has met another before takes over."""
-YIELDED = 0.3
-"""Seconds for which the last log of one that hands over is waited for."""
+YIELDED = 1.0
+"""Seconds for which the last log, or the checkpoint, of one that hands over is waited for."""
+COPIED = 2.0
+"""Seconds for which a checkpoint that cannot be followed will do."""
 ROUND = 0.02
 SPACING, SHARE = 0.25, 10.0
 """Seconds between two checkpoints that are asked for, and so many times what the last one took."""
@@ -94,8 +95,6 @@ class Standby:
         self._told = BoundedLog(1.0)
         self._name = f"{time.time_ns():x}"
         self._lock = threading.Lock()
-        self._stack = ExitStack()
-        self._feed: Callable[[str, Sample], None] | None = None
         now = seconds()
         self._holding: dict[int, float] = {}
         """Terms under which the name is held, and since when, s, this is known."""
@@ -109,7 +108,7 @@ class Standby:
         self._generation = self._epoch = 0
         self._met = False
         self._following = 0
-        self._over = threading.Event()
+        self._over, self._hurry = threading.Event(), threading.Event()
 
     def wait(self, stop: threading.Event) -> Succession | None:
         """Stand by until it is time to take over, or `stop` is set: None."""
@@ -132,6 +131,7 @@ class Standby:
             return None
         finally:
             self._over.set()
+            self._hurry.set()
             self._token.close()
             asking.join()
 
@@ -180,6 +180,7 @@ class Standby:
                 self._yielded.pop(int(term), None)
                 if alive and len(self._yielded) < MOST:
                     self._yielded[int(term)] = int(step), seconds()
+            self._hurry.set()
             self._inbox.wake()
 
     # On the thread that asks
@@ -188,16 +189,19 @@ class Standby:
         while not (stop.is_set() or self._over.is_set()):
             begin = seconds()
             self._ask_once({"what": "sign"})
-            if self._shadow.lacks and self._holding and begin > self._fetched:
+            if self._yielded and self._shadow.wanted:
+                self._fetch(stop, last=True)
+            elif self._shadow.lacks and self._holding and begin > self._fetched:
                 self._fetch(stop)
                 self._fetched = seconds() + max(SPACING, SHARE * (seconds() - begin))
-            self._over.wait(max(0.0, begin + self._takeover / 4 - seconds()))
+            self._hurry.wait(max(0.0, begin + self._takeover / 4 - seconds()))
+            self._hurry.clear()
 
     def _ask_once(self, request: dict[str, Any]) -> dict[str, Any]:
         """Ask the active process; its answer, empty if none came."""
         shadow, realm = self._shadow, self._config.bus.realm
         behind = shadow.newest[1] - shadow.mark[1] if shadow.newest[0] == shadow.mark[0] else 1
-        ready = shadow.ready and not shadow.wanted and behind <= 1
+        ready = shadow.ready and ((not shadow.wanted and behind <= 1) or seconds() - shadow.loaded < COPIED)
         said = {"name": self._name, "node": self._state.node, "step": shadow.mark[1], "ready": ready}
         payload = msgpack.packb(request | said | {"takeover": self._takeover})
         key = global_key(self._config.centre.name, "state", realm)
@@ -223,10 +227,12 @@ class Standby:
                 self._generation = max(self._generation, min(generation, MOST_GENERATION))
                 self._epoch = max(self._epoch, min(epoch, MOST_EPOCH))
 
-    def _fetch(self, stop: threading.Event) -> None:
-        """A checkpoint of the active process, part by part, into the inbox."""
+    def _fetch(self, stop: threading.Event, last: bool = False) -> None:
+        """A checkpoint of the active process, part by part, into the inbox. last: the one that it has made by itself,
+        since it hands over."""
         deadline = seconds() + FETCH
-        self._ask_once({"what": "state"})
+        if not last:
+            self._ask_once({"what": "state"})
         parts: dict[int, bytes] = {}
         of: object = None
         count = 1

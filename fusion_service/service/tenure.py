@@ -7,9 +7,9 @@ hub has told them, its own among them, and within that time. Clocks that go on w
 asked on a session that watches no tokens: one that does would answer from what it heard before it was frozen.
 
 Those who stand by ask `.../state`: for a sign of life, with which they say how far they have come; for a checkpoint, a
-part at a time, which is made between two steps; or, for an operator, to hand over: then the last step is published,
-`yields/{term}.{step}` announced, and no step made any more; should nobody have taken over in `HANDOVER` seconds, it
-goes on.
+part at a time, which is made between two steps; or, for an operator, to hand over: then the last step is published, a
+checkpoint held ready for who cannot follow, `yields/{term}.{step}` announced, and no step made any more; should nobody
+have taken over in `HANDOVER` seconds, it goes on.
 """
 
 from __future__ import annotations
@@ -222,13 +222,14 @@ class Tenure:
 
     def goes_on(self, centre: Centre, stop: threading.Event) -> bool:
         """Come by once a round: hand out what was asked for. Whether the process is still the active one."""
-        if self._wanted and self._step >= 0:
+        handing = self._handing and self.may_publish()
+        if (self._wanted or handing) and self._step >= 0:
             with self._lock:
-                names, self._wanted = list(self._wanted), {}
+                names, self._wanted = [*self._wanted, *(self._followers if handing else ())], {}
             held = Held(centre.epoch, self._step, centre.checkpoint())
             with self._lock:
                 self._held = dict(list(self._held.items())[-MOST:]) | dict.fromkeys(names, held)
-        if self._handing and self.may_publish():
+        if handing:
             self._yield(stop)
         return not self._gone()
 

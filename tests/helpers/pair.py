@@ -106,7 +106,7 @@ class Pair:
         return program
 
     def centre(self, which: int, standby: bool = False, more: str = "") -> Program:
-        """Start one of the two."""
+        """Start one of the two; more: settings of its own."""
         config = self._folder / f"centre{which}.toml"
         state = self._folder / f"state{which}"
         text = CONFIG.format(centre=self._centre + more, endpoint=self._endpoints[which], state=state)

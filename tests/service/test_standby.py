@@ -114,7 +114,7 @@ def test_where_the_bus_splits_both_go_on_and_the_later_one_stays(tmp_path: Path,
     assert before
 
 
-def test_nobody_hands_over_to_nobody(
+def test_none_hands_over_to_nobody_and_all_to_one_of_other_settings(
     hub: Hub, tmp_path: Path, stack: ExitStack, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pair = Pair((hub.endpoint, hub.endpoint), tmp_path, stack)
@@ -124,6 +124,13 @@ def test_nobody_hands_over_to_nobody(
     eventually(lambda: pair.watch.sees(0), 20)
     eventually(pair.watch.ready, 20)
     lonely.kill()
+    lonely.__exit__()
     eventually(lambda: not pair.watch.ready(), 5)
     assert main(["order", "handover", "--connect", hub.endpoint]) == 1
     assert "no handover: nobody stands by with the newest state" in capsys.readouterr().err
+    pair.centre(1, standby=True, more="gate = 0.98\n")  # an upgrade with other settings: it is copied, not followed
+    eventually(pair.watch.ready, 20)
+    before, number = pair.watch.pictures[-1].targets, len(pair.watch.pictures) - 1
+    assert main(["order", "handover", "--connect", hub.endpoint]) == 0
+    assert pair.taken_over(number).targets == before
+    assert pair.watch.faults() == []
