@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: demo test lint format docs wheel-test python-test bench studies clean
+.PHONY: demo test slow-test lint format docs wheel-test python-test bench studies clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/ready
@@ -13,6 +13,10 @@ demo: $(VENV)/ready
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(ARGS)
+
+# The tests that take tens of seconds each, which `make test` leaves out.
+slow-test: $(VENV)/ready
+	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check -q .

@@ -14,10 +14,12 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from types import FrameType
-from typing import TypeVar
+from typing import TextIO, TypeVar, cast
+
+from fusion_service.escape import Escaped, escaped
 
 __all__ = [
     "GRACE",
@@ -47,13 +49,21 @@ class _JsonFormatter(logging.Formatter):
         return json.dumps(entry)
 
 
+class _TextFormatter(logging.Formatter):
+    """A message that holds new lines cannot look like several."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        record.message = escaped(record.message).replace("\n", "\n    ")
+        return super().formatMessage(record)
+
+
 def set_up_logging(verbose: bool = False) -> None:
     """Log to stderr: text, or JSON lines under a service manager (systemd sets JOURNAL_STREAM)."""
     handler = logging.StreamHandler()
     if os.environ.get("JOURNAL_STREAM"):
         handler.setFormatter(_JsonFormatter())
     else:
-        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
+        handler.setFormatter(_TextFormatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
     logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler], force=True)
 
 
@@ -95,21 +105,23 @@ def stop_on_signals() -> Iterator[threading.Event]:
 def exit_code(program: str, call: Callable[[], object]) -> int:
     """Call it, and tell on stderr what a person can mend, as `program: ...`; returns what the process ends with.
 
-    What is no `FusionError`, no missing package and no trouble with a file is a fault of ours, and raised on.
+    What is printed is escaped (`escape`). What is no `FusionError`, no missing package and no trouble with a file is a
+    fault of ours, and raised on.
     """
     from fusion_service.errors import FusionError  # with NumPy: slow to load, so not before signals are heard
 
     try:
-        call()
+        with redirect_stdout(cast(TextIO, Escaped(sys.stdout))):
+            call()
     except FusionError as error:
         if error.exit_code:
-            print(error if error.places else f"{program}: {error}", file=sys.stderr)
+            print(escaped(str(error) if error.places else f"{program}: {error}"), file=sys.stderr)
         return error.exit_code
     except BrokenPipeError:  # whoever read our output has gone; nothing is flushed into it at the end either
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (ImportError, OSError) as error:
-        print(f"{program}: {error}", file=sys.stderr)
+        print(escaped(f"{program}: {error}"), file=sys.stderr)
         return 1
     return 0
 

@@ -16,7 +16,7 @@ GROUND_FLOOR = {
     f"fusion_service.{name}"
     for name in (
         *("linalg", "geodesy", "hulls", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
-        *("errors", "arrays", "order", "records", "turn", "ways", "source_words", "layout", "compiled"),
+        *("errors", "arrays", "order", "records", "turn", "ways", "source_words", "layout", "compiled", "escape"),
     )
 }
 STANDS_ON = {

@@ -165,6 +165,14 @@ class PairEvidence:
         full = full.take(np.lexsort((full.newer, full.older, -full.total)))
         return list(zip(full.older.tolist(), full.newer.tolist(), strict=True))
 
+    def open(self, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Those of these pairs of which the sum says no more that they are two than that they are one."""
+        if not pairs:
+            return []
+        against = self.sums.take(self.sums.total < 0.0)
+        two = set(zip(against.older.tolist(), against.newer.tolist(), strict=True))
+        return [pair for pair in pairs if pair not in two]
+
     def rebase(self, time: int) -> None:
         """A new era begins at `time`, ns: no datum is later."""
         first, second = np.minimum(self.sums.first, time), np.minimum(self.sums.second, time)

@@ -5,9 +5,9 @@ predicts on, its `updated` standing still, gives none). A track is confirmed by 
 were due, at the pace of its own sources, or at once by several sources. It coasts when the next report of every
 contributor is overdue, and ends after `coast` seconds or `coast_periods` of the slowest contributor, whichever is
 longer; a tentative one when N reports were due without a hit. One whose existence falls below `min_existence` is
-tentative again, and ends when overdue. Coasting is for silence: a track whose last local track is missing from a
-complete scan of its source ends unless the next report that is expected brings it back. One that has lost its local
-tracks otherwise is overdue since the last step that had one. How often the centre steps changes nothing of this.
+tentative again, and ends when overdue. One that has lost its local tracks is overdue since the last step that had one;
+and where the last was missing from a complete scan of a source that had judged its existence, it ends unless the next
+report that is expected brings it back. How often the centre steps changes nothing of this.
 """
 
 from __future__ import annotations
@@ -131,8 +131,8 @@ class Support:
     """What feeds G global tracks in a step. sources (G,): how many sources whose next report is not overdue; hit (G,):
     whether a new measurement came in; due (G,): ns at which the next report of the last of them is overdue, -1 where
     none is believed; interval (G,): ns between reports of the slowest of them; left (G,): no local track is linked any
-    more; dropped (G,): nor is it because a complete scan of this step did not list the last of them. before: ns of the
-    last step."""
+    more; dropped (G,): nor is it because a complete scan of this step, of a source that judged its existence, did not
+    list the last of them. before: ns of the last step."""
 
     sources: NDArray[np.intp]
     hit: NDArray[np.bool_]

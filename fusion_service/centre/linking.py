@@ -22,6 +22,7 @@ from fusion_service.arrays import Bools, Floats, Ints, among
 from fusion_service.centre.births import group, locals_of
 from fusion_service.centre.candidates import Candidates, find_candidates
 from fusion_service.centre.copies import Copies
+from fusion_service.centre.emptied import emptied
 from fusion_service.centre.evidence import LOW, PairEvidence, RivalLinks, Tests
 from fusion_service.centre.gating import Judgement, Settings, judge
 from fusion_service.centre.ids import Ids
@@ -75,8 +76,9 @@ class Linker:
         judged = judge(rows, now, meeting.forced_row, time, self._settings, journal)
         near = find_candidates(rows, now, meeting, judged, self.tests, self._places, self._beside)
         near = _without_broken(near, rows, now, judged)
+        before, believed = rows.tracks.link.copy(), rows.inside_mask()
         joined = self._assign(rows, now, _vacant(near, meeting), step, journal)
-        merged = self._merge(rows, now, near, step, journal)
+        merged = self._merge(rows, now, near, emptied(rows, before, believed, now, near.tracks), step, journal)
         if not merged:
             merged = self.copies.joined(rows, now, near, meeting, step, time, journal)
         free = near.loose[rows.tracks.link[near.loose] == NO_TRACK]
@@ -263,15 +265,18 @@ class Linker:
                 self.merges.part(min(old, link), max(old, link), self.tests.bound)
         return picture.join(newborn(new, len(self.config.space), time))
 
-    def _merge(self, rows: Rows, now: Picture, near: Candidates, step: int, journal: Journal) -> dict[int, int]:
-        """Join global tracks that share no source and that the evidence says are one: {newer id: older id}."""
+    def _merge(
+        self, rows: Rows, now: Picture, near: Candidates, left: list[tuple[int, int]], step: int, journal: Journal
+    ) -> dict[int, int]:
+        """Join global tracks that share no source and that the evidence says are one: {newer id: older id}. left: pairs
+        of which one was emptied into the other, which are one unless the evidence says that they are two."""
         pairs = near.tracks
         if len(pairs.first):
             masks = _masks(rows, now)
             pairs = pairs.take((masks[pairs.first] & masks[pairs.second]) == 0)
         same = self.tests.sameness(pairs.distance, pairs.size)
         self.merges.add(pairs.first, pairs.second, same, now, self.tests.bound)
-        ripe = self.merges.ripe(self.tests.bound)
+        ripe = self.merges.ripe(self.tests.bound) + self.merges.open(left)
         far: dict[tuple[int, int], float] = {}
         if ripe:
             ids = zip(now.id[pairs.first].tolist(), now.id[pairs.second].tolist(), strict=True)

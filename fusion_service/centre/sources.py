@@ -34,9 +34,9 @@ class Source:
     speaks in. why: the reason that data of it are not used, in a sentence; unused: tracks that were not, by reason.
     lag: how far behind the last step its messages come, ns, about the longest of late. places: of its newest messages
     that say one. Of the step being made: came, the time of each message with tracks, and when it came, ns; arrived, the
-    ids that came; dropped, the links of tracks that complete scans list no more; pairs, the versions of what came,
-    where those are followed; ahead, the time of the newest message that is for a later one. declared: its info, and
-    what holds for it by that and the config.
+    ids that came; dropped, the links of tracks whose existence it judged and that complete scans list no more; pairs,
+    the versions of what came, where those are followed; ahead, the time of the newest message that is for a later one.
+    declared: its info, and what holds for it by that and the config.
     """
 
     name: str
@@ -134,7 +134,7 @@ class Source:
         if complete and end >= self.complete and stays.any():
             listed = ~stays | (old.time > end)
             listed[~listed] = among(old.id[~listed], messages[-1].ids)
-            stays, gone = stays & listed, old.link[~listed]
+            stays, gone = stays & listed, old.link[~listed & np.isfinite(old.existence)]
         if stays.any():
             merged = join_tracks([old.take(stays), merged])
             merged = merged.take(np.argsort(merged.id, kind="stable"))

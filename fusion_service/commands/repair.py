@@ -8,7 +8,7 @@ from pathlib import Path
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
-HELP = "Make the torn recording of a recorder that was killed whole, in place."
+HELP = "Make a torn or damaged recording whole, in place."
 EXAMPLE = "fusion-service repair mission.rrd\n  fusion-service repair mission/         every part of a mission"
 
 

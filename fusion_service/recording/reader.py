@@ -7,16 +7,17 @@ on a copy. What was flushed is never lost.
 A mission in parts is read part by part, as one. What a part repeats of an earlier one is left out; a part that is
 missing, or a time without a recorder, is logged.
 
-The file (RRF2) is a header of 12 bytes, then records: kind and length (u64 each, little-endian), payload.
+The file (RRF2) is a header of 12 bytes, then records: kind and length (u64 each, little-endian), payload. What is
+damaged within is left out, and said (`salvage`).
 """
 
 from __future__ import annotations
 
+import contextlib
 import heapq
 import logging
 import os
 import shutil
-import struct
 import tempfile
 import warnings
 from collections import Counter
@@ -29,13 +30,12 @@ import numpy as np
 from fusion_service.errors import ReviewError
 from fusion_service.recording.columns import import_rerun
 from fusion_service.recording.parts import number_of, parts
+from fusion_service.recording.salvage import HEADER, salvage, whole_part
 from schemas import Message, MessageError, decode
 
 __all__ = ["RawMessage", "has_index", "messages", "read", "recording_id", "repair"]
 
 log = logging.getLogger(__name__)
-
-MAGIC, HEADER, RECORD, END = b"RRF2", 12, struct.Struct("<QQ"), 0
 
 
 class RawMessage(NamedTuple):
@@ -101,7 +101,7 @@ def _read_file(path: Path, begins: list[str] | None = None) -> Iterator[tuple[Ra
     with tempfile.TemporaryDirectory(prefix="rrd-") as folder:
         waiting: list[tuple[RawMessage, bool]] = []
         following = 0
-        for chunk in _open_whole(path, Path(folder)).stream().filter(content=content):
+        for chunk in _chunks(path, Path(folder), content):
             if begins is not None and not chunk.entity_path.startswith("/raw/"):
                 batch = chunk.to_record_batch()
                 if "begins" in batch.schema.names:
@@ -109,12 +109,42 @@ def _read_file(path: Path, begins: list[str] | None = None) -> Iterator[tuple[Ra
                 continue
             standing = chunk.entity_path.startswith("/raw/standing/")
             for message in _rows(chunk):
-                heapq.heappush(waiting, (message, standing))
+                if message.arrival >= following:  # else it was read before a damage was met
+                    heapq.heappush(waiting, (message, standing))
             while waiting and waiting[0][0].arrival == following:
                 yield heapq.heappop(waiting)
                 following += 1
-        while waiting:  # after a gap: the part of the last flush that a torn file has lost
-            yield heapq.heappop(waiting)
+        last = -1
+        while waiting:  # after a gap: what a torn or damaged file has lost
+            one = heapq.heappop(waiting)
+            if one[0].arrival != last:
+                yield one
+            last = one[0].arrival
+
+
+def _chunks(path: Path, folder: Path, content: list[str]) -> Iterator[Any]:
+    """The chunks of a file. Of a torn one, those of its whole part; where it is damaged, those of what decodes."""
+    whole, damaged = whole_part(path)
+    copy = folder / path.name
+    try:
+        if not damaged:
+            yield from _open(_torn(path, copy, whole), path).stream().filter(content=content)
+    except RuntimeError:
+        damaged = True
+    if damaged:
+        lost = salvage(path, copy)
+        log.warning("%s is damaged: %s", path, lost)
+        yield from _open(copy, path).stream().filter(content=content)
+
+
+def _torn(path: Path, copy: Path, whole: int) -> Path:
+    """`path`, or if that is torn, its `whole` part in `copy`."""
+    if not 0 < whole < path.stat().st_size:
+        return path
+    log.warning("%s is torn: reading the whole part", path)
+    shutil.copyfile(path, copy)
+    os.truncate(copy, whole)
+    return copy
 
 
 def recording_id(path: Path) -> str:
@@ -154,38 +184,24 @@ def _counts(counter: Counter[str]) -> str:
     return ", ".join(f"{reason} {count}" for reason, count in sorted(counter.items()))
 
 
-def _open_whole(path: Path, folder: Path) -> Any:
-    """A reader of `path`, or if that is torn, of its whole part in `folder`."""
-    try:
-        return _open(path)
-    except _TornError as error:
-        log.warning("%s: reading the whole part", error)
-        copy = folder / path.name
-        shutil.copyfile(path, copy)
-        repair(copy)
-        return _open(copy)
-
-
 def repair(path: str | Path) -> int:
     """Cut a torn recording, in place, after its last whole record, so that viewers open it. Returns the bytes cut,
-    0 for a file that opens. `ReviewError` for a file that is no recording."""
+    0 for a file that is not torn. `ReviewError` for a file that is no recording."""
     path = Path(path)
-    try:
-        _open(path)
+    if not path.is_file():
+        raise FileNotFoundError(f"no recording at {path}")
+    (whole, damaged), size = whole_part(path), path.stat().st_size
+    if damaged:
         return 0
-    except _TornError:
-        size = path.stat().st_size
-        os.truncate(path, _whole(path))
+    if 0 < whole < size:
+        os.truncate(path, whole)
+    with contextlib.suppress(RuntimeError):  # damaged as well
         _open(path)
-        return size - path.stat().st_size
+    return size - path.stat().st_size
 
 
-class _TornError(Exception):
-    """A recording that ends within a record."""
-
-
-def _open(path: Path) -> Any:
-    """A reader of `path`."""
+def _open(path: Path, named: Path | None = None) -> Any:
+    """A reader of `path`, which is `named` in errors. `RuntimeError` where it is damaged."""
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
     import_rerun()
@@ -197,26 +213,10 @@ def _open(path: Path) -> Any:
             reader = RrdReader(path)
             if reader.recordings():
                 return reader
-        except RuntimeError as error:
-            if 0 < _whole(path) < path.stat().st_size:
-                raise _TornError(f"{path} is torn ({error})") from None
-    raise ReviewError(f"{path} is not a recording")
-
-
-def _whole(path: Path) -> int:
-    """The length of `path` up to the end of its last whole record, 0 for another kind of file."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        if file.read(HEADER)[:4] != MAGIC:
-            return 0
-        whole = HEADER
-        while whole + RECORD.size <= size:
-            file.seek(whole)
-            kind, length = RECORD.unpack(file.read(RECORD.size))
-            if kind == END or whole + RECORD.size + length > size:
-                break
-            whole += RECORD.size + length
-    return whole
+        except RuntimeError:
+            if whole_part(path)[0] > HEADER and not named:
+                raise
+    raise ReviewError(f"{named or path} is not a recording, or nothing of it can be read")
 
 
 def _rows(chunk: Any) -> Iterator[RawMessage]:

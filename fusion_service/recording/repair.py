@@ -1,8 +1,9 @@
-"""Making a torn recording whole.
+"""Making a torn or damaged recording whole.
 
 A recorder that was killed leaves a file without its index, perhaps with half a record at its end. The end is cut in
 place; the index is then written by Rerun's own tool, into a copy that takes the file's place when it holds the same
-number of messages. A file without an index opens as well, only more slowly.
+number of messages. A file without an index opens as well, only more slowly. Of a file that is damaged within, what
+decodes takes its place, and the damaged one is kept beside it.
 """
 
 from __future__ import annotations
@@ -20,25 +21,29 @@ from fusion_service.errors import ReviewError
 from fusion_service.recording.parts import nobody_writes, parts
 from fusion_service.recording.program import find_program, quiet
 from fusion_service.recording.reader import has_index, read, repair
+from fusion_service.recording.salvage import Lost, decodes, salvage, whole_part
 
 __all__ = ["Mended", "mend", "mend_all"]
 
 log = logging.getLogger(__name__)
 
 MERGE_TIME = 600.0
+DAMAGED = ".damaged"
 
 
 @dataclass(frozen=True, slots=True)
 class Mended:
-    """What was done to a recording: bytes `cut` at its end, whether an index was written, and why not if it lacks one
-    still."""
+    """What was done to a recording: bytes `cut` at its end, what was `lost` to a damage within, whether an index was
+    written, and why not if it lacks one still."""
 
     cut: int = 0
+    lost: Lost = Lost()
     indexed: bool = False
     why_not: str = ""
 
     def __str__(self) -> str:
         done = [f"{self.cut} bytes of a torn record cut at its end"] * bool(self.cut)
+        done += [f"{self.lost}; the damaged file is kept as *{DAMAGED}"] * bool(self.lost.bytes)
         done += ["index written"] * self.indexed
         done += [f"opens, without an index ({self.why_not})"] * bool(self.why_not)
         return ", ".join(done) or "whole, nothing to be done"
@@ -51,10 +56,29 @@ def mend(path: Path, *, index: bool = True) -> Mended:
         raise ReviewError(f"no recording at {path}")
     with nobody_writes(path):
         cut = repair(path)
+        lost = _salvage(path) if whole_part(path)[1] or not decodes(path) else Lost()
         if has_index(path) or not index:
-            return Mended(cut)
+            return Mended(cut, lost)
         why_not = _index(path)
-        return Mended(cut, not why_not, why_not)
+        return Mended(cut, lost, not why_not, why_not)
+
+
+def _salvage(path: Path) -> Lost:
+    """Put what decodes in place of `path`, which is kept. `ReviewError` where nothing does, or the disk is full."""
+    copy = path.with_name(f".{path.name}.salvaged")
+    try:
+        lost = salvage(path, copy)
+        if not decodes(copy):
+            raise ReviewError(f"{path}: nothing of it can be read")
+        os.replace(path, path.with_name(path.name + DAMAGED))
+        os.replace(copy, path)
+    except OSError as error:
+        raise ReviewError(
+            f"{path} is damaged, and what is whole of it could not be written: {error.strerror}"
+        ) from error
+    finally:
+        copy.unlink(missing_ok=True)
+    return lost
 
 
 def mend_all(path: Path, stop: Callable[[], bool]) -> Iterator[tuple[Path, Mended | ReviewError]]:

@@ -109,12 +109,13 @@ def read_vehicle(path: Path) -> list[Report]:
 def _read(path: Path, names: tuple[str, ...]) -> Floats:
     """The named columns (R, len(names)). FileNotFoundError; ValueError says which line cannot be read."""
     rows = []
-    with path.open(encoding="utf-8", newline="") as file:
-        for line, row in enumerate(csv.DictReader(file), start=2):
-            try:
+    with path.open(encoding="utf-8", newline="", errors="replace") as file:
+        reader = csv.DictReader(file)
+        try:
+            for row in reader:
                 rows.append([float(row[name]) for name in names])
-            except (KeyError, TypeError, ValueError) as error:
-                raise ValueError(f"{path}:{line}: cannot be read ({type(error).__name__}: {error})") from None
+        except (KeyError, TypeError, ValueError, csv.Error) as error:
+            raise ValueError(f"{path}:{reader.line_num}: cannot be read ({type(error).__name__}: {error})") from None
     if not rows:
         raise ValueError(f"{path}: no rows")
     found = np.array(rows)

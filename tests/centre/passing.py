@@ -32,9 +32,11 @@ def boats(second: float) -> NDArray[np.float64]:
     return np.array([[4.0 * (second - 30), 0.0, 4.0, 0.0], [5.5 * (second - 30), 8.0, 5.5, 0.0]])
 
 
-def passing(*, camera: bool, blob: bool = False, seed: int = 1, new_id: bool = True, **config: Any) -> Passed:
+def passing(
+    *, camera: bool, blob: bool = False, seed: int = 1, new_id: bool = True, judged: bool = False, **config: Any
+) -> Passed:
     """blob: the lidar says that its tracks may be blobs, and how large; new_id: after the pass the second boat is a new
-    track of the lidar."""
+    track of the lidar; judged: the lidar reports existence."""
     print(f"seed {seed}")
     rng = np.random.default_rng(seed)
     made = centre((), period=1.0, **config)
@@ -45,7 +47,7 @@ def passing(*, camera: bool, blob: bool = False, seed: int = 1, new_id: bool = T
     results, true = [], []
     for second in range(1, SECONDS):
         states = boats(second)
-        give(made, _lidar(second, states, blob, new_id, rng))
+        give(made, _lidar(second, states, blob, new_id, judged, rng))
         if camera:
             give(made, tracks("camera", second, states + rng.normal(size=(2, 4)) * CAMERA, sigma=CAMERA))
         results.append(step(made, second))
@@ -54,7 +56,7 @@ def passing(*, camera: bool, blob: bool = False, seed: int = 1, new_id: bool = T
 
 
 def _lidar(
-    second: int, states: NDArray[np.float64], blob: bool, new_id: bool, rng: np.random.Generator
+    second: int, states: NDArray[np.float64], blob: bool, new_id: bool, judged: bool, rng: np.random.Generator
 ) -> schemas.LocalTracks:
     merged = second in MERGED
     means = states.mean(axis=0, keepdims=True) if merged else states
@@ -62,6 +64,8 @@ def _lidar(
     said: dict[str, Any] = {}
     if blob:
         said = {"reference": "blob", "extent": np.array([BLOB if merged else HULL] * len(ids)), "shape": "box"}
+    if judged:
+        said["existence"] = np.full(len(ids), 0.95)
     return tracks("lidar", second, means + rng.normal(size=means.shape) * LIDAR, ids, sigma=LIDAR, **said)
 
 

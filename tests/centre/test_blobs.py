@@ -59,7 +59,7 @@ def test_a_lidar_that_says_blob_holds_both_alone(seed: int) -> None:
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_of_a_lidar_that_does_not_say_so_the_second_ends_with_the_next_report_and_the_first_goes_on(seed: int) -> None:
     """Its row is 4 m off both boats and claims 0.5 m: nothing tells that from a boat that was dropped."""
-    passed = passing(camera=False, seed=seed)
+    passed = passing(camera=False, seed=seed, judged=True)
     there = {second: r.tracks.ids.tolist() for second, r in enumerate(passed.results, 1)}
     first = MERGED.start
     assert there[first] == there[first + 1] == [1, 2], "not dropped at once"
@@ -75,7 +75,8 @@ def test_a_track_that_is_dropped_with_nobody_near_ends_at_once() -> None:
     lives = []
     for second in range(1, 20):
         now = far if second < 12 else far[:1]
-        give(made, tracks("lidar", second, now, sigma=LIDAR, reference="blob"))
+        judged = np.full(len(now), 0.95)
+        give(made, tracks("lidar", second, now, sigma=LIDAR, reference="blob", existence=judged))
         lives.append(2 in step(made, second).tracks.ids.tolist())
     near = passing(camera=False, blob=True)
     assert lives.count(True) < 18

@@ -35,7 +35,9 @@ def honest(found: Mapping[str, Score]) -> None:
         assert score.worst <= 1.05 + 3 * score.error, (name, score)
 
 
-@pytest.mark.parametrize(("graph", "steps"), [("pair", 300), ("tree", 120), ("ring", 120)])
+@pytest.mark.parametrize(
+    ("graph", "steps"), [pytest.param("pair", 300, marks=pytest.mark.slow), ("pair", 120), ("tree", 120), ("ring", 120)]
+)
 def test_every_centre_is_honest_and_no_worse_than_alone(graph: str, steps: int) -> None:
     """Unequal sensors: what one centre sees badly the other sees well."""
     together = scores(network(graph, targets=40, seed=3), steps)

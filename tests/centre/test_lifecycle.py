@@ -1,7 +1,8 @@
-"""A track that its sources drop ends; one whose sources are silent coasts."""
+"""A track that sources drop which judge existence ends; one whose sources are silent, or list it no more, coasts."""
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,15 @@ def truth(second: float) -> Array:
     return PLACES + second * np.array([[10.0, 0, 0, 0]] * 2)
 
 
-def until_gone(made: FusionCentre, sources: dict[str, float], drops: float, every: float = 1.0) -> tuple[float, Any]:
+def until_gone(
+    made: FusionCentre,
+    sources: dict[str, float],
+    drops: float,
+    every: float = 1.0,
+    judging: Container[str] | None = None,
+) -> tuple[float, Any]:
     """How long after `drops`, s, the second target is in the picture, of which each source (name -> period, s) lists
-    only the first from then on; and the statuses that it had."""
+    only the first from then on; and the statuses that it had. judging: those that report existence, None: all."""
     give(made, *(info(name, period=period) for name, period in sources.items()))
     statuses: list[int] = []
     sent = dict.fromkeys(sources, 0.0)
@@ -31,7 +38,9 @@ def until_gone(made: FusionCentre, sources: dict[str, float], drops: float, ever
             while sent[name] + period <= second:
                 sent[name] += period
                 shown = 1 if sent[name] > drops else 2
-                give(made, tracks(name, sent[name], truth(sent[name])[:shown], seq=round(1000 * sent[name])))
+                judged = np.full(shown, 0.95) if judging is None or name in judging else None
+                seq = round(1000 * sent[name])
+                give(made, tracks(name, sent[name], truth(sent[name])[:shown], seq=seq, existence=judged))
         picture = step(made, second).tracks
         second_one = picture.status[picture.means[:, 1] > 2000.0]
         statuses += second_one.tolist()
@@ -48,6 +57,22 @@ def test_what_its_source_drops_ends_after_the_next_report(period: float) -> None
         assert 2 * period < gone <= 2.5 * period + 1.0, f"coast {coast}: {gone} s"
         assert CONFIRMED in statuses
         assert COASTING in statuses
+
+
+@pytest.mark.parametrize("sources", [{"r1": 1.0}, {"r1": 0.5, "r2": 1.0}])
+@pytest.mark.parametrize("coast", [3.0, 8.0])
+def test_what_lists_of_what_is_seen_hold_no_more_coasts(sources: dict[str, float], coast: float) -> None:
+    """A source that reports no existence lists what it sees, which is no word on what there is."""
+    gone, statuses = until_gone(centre((), coast=coast), sources, 20.0, judging=())
+    assert coast < gone <= coast + 2.5, f"{gone} s"
+    assert statuses[-1] == COASTING
+
+
+def test_the_word_of_the_last_to_drop_it_counts() -> None:
+    """Of two, one judges existence."""
+    sources = {"first": 0.5, "last": 4.0}
+    assert until_gone(centre((), coast=30.0), sources, 20.0, judging=("last",))[0] <= 11.0
+    assert until_gone(centre((), coast=30.0), sources, 20.0, judging=("first",))[0] > 30.0
 
 
 def test_the_last_of_two_sources_to_drop_it_decides() -> None:
@@ -70,7 +95,8 @@ def test_what_is_dropped_and_listed_again_in_the_next_report_keeps_its_number() 
     for second in range(1, 41):
         if second % 2 == 0:
             ids = [1, 2] if second < 20 else [1] if second == 20 else [1, 3]
-            give(made, tracks("r1", second, truth(second)[: len(ids)], ids))
+            judged = np.full(len(ids), 0.95)
+            give(made, tracks("r1", second, truth(second)[: len(ids)], ids, existence=judged))
         seen |= set(step(made, second).tracks.ids.tolist())
     assert len(seen) == 2
 

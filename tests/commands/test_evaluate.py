@@ -185,6 +185,22 @@ def test_a_torn_recording_is_scored_as_far_as_it_goes(
     assert "Fused tracks (ci) followed" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("place", ["header", "field"])
+def test_a_table_with_a_field_too_long_is_told_in_one_line(
+    place: str, flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Longer than Python's `csv` takes."""
+    table = tmp_path / "truth.csv"
+    export(flown, table)
+    lines = table.read_text("utf-8").splitlines()
+    number = 0 if place == "header" else 5
+    table.write_text("\n".join([*lines[:number], lines[number] + "x" * 140_000, *lines[number + 1 :]]), "utf-8")
+    assert main(["evaluate", str(flown), "--truth", str(table)]) == 1
+    told = capsys.readouterr().err
+    assert "truth.csv is no CSV table (field larger than field limit" in told
+    assert told.count("\n") == 1
+
+
 def test_reactions_need_the_log_of_the_step() -> None:
     """The last message of a step came 0.2 s before its picture, by the recorder's clock."""
     sent = [one for one in mission(4) if not isinstance(one.message, StepLog)]

@@ -16,7 +16,13 @@ STUDIES = catalogue()
 DATA = data_folder("autoferry")
 
 
-@pytest.mark.parametrize("study", STUDIES.values(), ids=STUDIES)
+LONG = {"autoferry", "li-nonlinear", "sharma-three-radars", "tracklets", "unequal-sensors"}
+"""Tens of seconds each, for they fly whole missions: `make slow-test`."""
+
+
+@pytest.mark.parametrize(
+    "study", [pytest.param(one, id=name, marks=[pytest.mark.slow] * (name in LONG)) for name, one in STUDIES.items()]
+)
 def test_the_same_seed_gives_the_same_table(study: Study, tmp_path: Path) -> None:
     if study.needs_data and not DATA:
         pytest.skip("FUSION_DATA names no folder of the Autoferry recordings")

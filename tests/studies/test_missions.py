@@ -239,6 +239,7 @@ def test_missing_data_are_told_in_a_line(
     assert "\n" not in told.split("autoferry: ")[-1]
 
 
+@pytest.mark.slow
 @needs_data
 def test_autoferry_takes_rules_that_a_config_can_say() -> None:
     rules = (fuser("ci:criterion=trace"), fuser("ci:weights=uniform"))

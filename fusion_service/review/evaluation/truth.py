@@ -48,6 +48,13 @@ def _recorded(path: Path) -> Iterator[Truth]:
 
 
 def _csv(path: Path) -> Iterator[FlatTable]:
+    try:
+        yield from _csv_parts(path)
+    except csv.Error as error:
+        raise ReviewError(f"{path} is no CSV table ({error})") from None
+
+
+def _csv_parts(path: Path) -> Iterator[FlatTable]:
     with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
         reader = csv.DictReader(file)
         wanted = _wanted(tuple(reader.fieldnames or ()), path)
