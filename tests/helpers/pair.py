@@ -80,13 +80,17 @@ class Watch:
         born = [int(one) for log in self.logs for one in log.decisions.track[log.decisions.kind == BORN]]
         found += [f"id {one} born twice" for one in sorted({one for one in born if born.count(one) > 1})]
         ended: set[int] = set()
-        epoch = 0
+        epoch = first = 0
         for seen in self.pictures:
             found += [f"id {one} came back" for one in ended.intersection(seen.picture.ids.tolist())]
             ended.update(one for one, _, _ in seen.picture.ended)
             if seen.picture.epoch < epoch:
-                found.append(f"a picture of run {seen.picture.epoch} after one of run {epoch}")
-            epoch = max(epoch, seen.picture.epoch)
+                late = (seen.picture.sent - first) / 1e9
+                found.append(
+                    f"a picture of run {seen.picture.epoch} after one of run {epoch}, sent {late:.3f} s after it"
+                )
+            elif seen.picture.epoch > epoch:
+                epoch, first = seen.picture.epoch, seen.picture.sent
         return found
 
 
