@@ -4,8 +4,8 @@ It hears what the active process hears, follows its step logs (see `shadow`), an
 in `takeover` seconds (see `tenure`). It takes over when
 
 - the active one's token is gone, and `GRACE` seconds later nobody else's is there;
-- no sign of it came for `takeover` seconds, a question asked in that time was not answered though this process was
-  awake, and the hub answers: it is frozen, or its machine is;
+- no sign of it came for `takeover` seconds, in most of which this process was awake itself, and the hub answers: the
+  other is frozen, or its machine is;
 - it hands over by order.
 
 Not while the hub is away, nor for `REJOINED` seconds after that, since the other may need as long to be back; nor when
@@ -47,8 +47,8 @@ YIELDED = 1.0
 COPIED = 2.0
 """Seconds for which a checkpoint that cannot be followed will do."""
 ROUND = 0.02
-AWAKE = 0.3
-"""Seconds that a question may take beyond its time: more, and this process was frozen itself."""
+AWAKE, MOST_AWAKE = 0.7, 0.25
+"""Of the time without a sign, in which this process must have been awake; seconds that one round counts at most."""
 SPACING, SHARE = 0.25, 10.0
 """Seconds between two checkpoints that are asked for, and so many times what the last one took."""
 FETCH = 5.0
@@ -104,7 +104,8 @@ class Standby:
         self._yielded: dict[int, tuple[int, float]] = {}
         self._begun = self._none_since = now
         self._sign = now
-        self._unanswered = 0
+        self._awake = 0.0
+        """Seconds since the last sign in which this process was awake itself."""
         self._age = 0.0
         self._away = -REJOINED
         self._round = self._saved = self._fetched = now
@@ -165,7 +166,7 @@ class Standby:
         scope, name, _ = key.rsplit("/", 3)[-3:]
         source = centre_source(name) if scope == "global" else name
         if scope == "global" and name == self._config.centre.name:
-            self._sign, self._unanswered = seconds(), 0
+            self._sign, self._awake = seconds(), 0.0
         self._inbox.put(source, Sample(key, data, time.time_ns()), len(data))
 
     def _on_term(self, key: str, alive: bool) -> None:
@@ -211,7 +212,7 @@ class Standby:
         said = {"name": self._name, "node": self._state.node, "step": shadow.mark[1], "ready": ready}
         payload = msgpack.packb(request | said | {"takeover": self._takeover})
         key = global_key(self._config.centre.name, "state", realm)
-        begin, patience = seconds(), 0.75 * self._takeover
+        patience = 0.75 * self._takeover
         try:
             answers = [msgpack.unpackb(data) for _, data in self._bus.ask(key, payload, patience)]
         except (BusError, ValueError):
@@ -220,14 +221,12 @@ class Standby:
         answer: dict[str, Any] = max(sound, key=lambda one: int(one["term"]), default={})
         if answer:
             self._heard(answer)
-        elif seconds() - begin < patience + AWAKE:
-            self._unanswered += 1
         return answer
 
     def _heard(self, answer: dict[str, Any]) -> None:
         generation, epoch, nodes, age = (answer.get(name) for name in ("generation", "epoch", "nodes", "age"))
         with self._lock:
-            self._sign, self._met, self._unanswered = seconds(), True, 0
+            self._sign, self._met, self._awake = seconds(), True, 0.0
             self._age = float(age) if isinstance(age, (int, float)) else 0.0
             said = list(nodes.items())[:MOST] if isinstance(nodes, dict) else []
             self._nodes = {str(name): node for name, node in said if type(node) is int}
@@ -298,17 +297,18 @@ class Standby:
     def _due(self) -> str:
         """Why it is time to take over, "" while it is not."""
         now = seconds()
-        slept, self._round = now - self._round > self._takeover / 2, now
+        passed, self._round = now - self._round, now
+        self._awake += min(passed, MOST_AWAKE)
         with self._lock:
             if not self._bus.connected:
                 self._away = now
-            if slept:
+            if passed > self._takeover / 2:
                 self._none_since = now
             if not self._met and not self._state.has_node:
                 return ""
             self._settle_node()
             if now - self._away < REJOINED:
-                self._sign, self._unanswered, self._none_since = now, 0, now
+                self._sign, self._awake, self._none_since = now, 0.0, now
                 return ""
             patience = RANK * self._rank()
             if self._holding:
@@ -325,7 +325,7 @@ class Standby:
             step, since = self._yielded[term]
             if self._shadow.mark[1] >= step or now - since > YIELDED:
                 return "it hands over"
-        if now - self._sign > self._takeover + patience and self._unanswered:
+        if min(now - self._sign, self._awake / AWAKE) > self._takeover + patience:
             return f"no sign of it for {now - self._sign:.1f} s"
         hung = HUNG * max(1.0, self._config.centre.period, self._config.service.status_period)
         return f"its loop stands still for {self._age:.0f} s" if self._age > hung else ""

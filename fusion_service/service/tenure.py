@@ -124,6 +124,7 @@ class Tenure:
         self._bus.watch(self._key("standby", "*"), self._on_follower)
         self._bus.answer(global_key(self._name, "state", self._realm), self._answer)
         self._passed = seconds()
+        log.info("active as %s, term %d", self._name, term)
 
     def _key(self, what: str, name: str) -> str:
         return token_key(self._name, what, name, self._realm)

@@ -111,7 +111,9 @@ def test_where_the_bus_splits_both_go_on_and_the_later_one_stays(tmp_path: Path,
     assert first is not None
     first.signal(signal.SIGTERM)
     assert f"stands down: another is active under term {terms[1]}" in first.end()[1]
-    assert before
+    faults = [one for watch in (near, far) for one in watch.faults()]
+    assert all(one.startswith("a picture of run") for one in faults), faults  # on its way when the bus was whole again
+    assert set(before.values()) <= set(near.pictures[-1].targets.values())
 
 
 def test_none_hands_over_to_nobody_and_all_to_one_of_other_settings(
