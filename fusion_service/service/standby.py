@@ -113,13 +113,14 @@ class Standby:
         self._generation = self._epoch = 0
         self._met = False
         self._following = 0
+        self._asking: threading.Thread | None = None
         self._over, self._hurry = threading.Event(), threading.Event()
 
     def wait(self, stop: threading.Event) -> Succession | None:
         """Stand by until it is time to take over, or `stop` is set: None."""
         self._declare()
-        asking = threading.Thread(target=self._ask, args=(stop,), daemon=True)
-        asking.start()
+        self._asking = threading.Thread(target=self._ask, args=(stop,), daemon=True)
+        self._asking.start()
         notify("READY=1")
         name = self._config.centre.name
         log.info("standing by for %s", name)
@@ -138,7 +139,11 @@ class Standby:
             self._over.set()
             self._hurry.set()
             self._token.close()
-            asking.join()
+
+    def join(self) -> None:
+        """Wait until the last question has had its time: before the bus is closed."""
+        if self._asking is not None:
+            self._asking.join()
 
     def hand_on(self, feed: Callable[[str, Sample], None]) -> None:
         """Give the service that has begun here what was in no step yet, and hear nothing any more."""

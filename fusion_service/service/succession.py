@@ -66,6 +66,7 @@ def _part(
         if standby:
             heard = stack.enter_context(ExitStack())
             waiting = Standby(config, heard.enter_context(open_bus(config.bus.connect, stop=stop)), probe, state)
+            heard.callback(waiting.join)
             heritage = waiting.wait(stop)
             if heritage is None:
                 return True
@@ -73,15 +74,18 @@ def _part(
             why = f"took over: {heritage.why}"
         bus = stack.enter_context(open_bus(config.bus.connect, stop=stop))
         service = make(config, bus, state, Tenure(config, bus, probe, why))
-        service.run(stop, _hand_on(waiting, service, heard) if waiting is not None else None)
+        service.run(stop, _hand_on(waiting, service, heard, stack) if waiting is not None else None)
     return True
 
 
-def _hand_on(waiting: Standby, service: Active, heard: ExitStack) -> Callable[[], None]:
-    """Gives the service that has begun what waits for it, and ends the session on which that was heard."""
+def _hand_on(waiting: Standby, service: Active, heard: ExitStack, stack: ExitStack) -> Callable[[], None]:
+    """Gives the service that has begun what waits for it, and ends the session on which that was heard, in a thread of
+    its own, since the last question there may wait for its answer; `stack` waits for that at the end."""
 
     def begun() -> None:
         waiting.hand_on(lambda source, one: service.feed(source, one.key, one.data, one.received))
-        heard.close()
+        closing = threading.Thread(target=heard.close)
+        closing.start()
+        stack.callback(closing.join)
 
     return begun
