@@ -2,6 +2,7 @@
 
 {realm}/v1/local/{source}/tracks|intensity|info|alive
 {realm}/v1/global/{centre}/tracks|log|status|alive|picture|orders|state
+{realm}/v1/global/{centre}/orders/{operator}
 {realm}/v1/global/{centre}/holds|yields|standby/{name}
 {realm}/v1/truth/{scenario}
 """
@@ -20,6 +21,7 @@ __all__ = [
     "check_source",
     "global_key",
     "local_key",
+    "order_key",
     "parse_key",
     "token_key",
     "truth_key",
@@ -101,6 +103,12 @@ def token_key(centre: str, what: str, name: str, realm: str = REALM) -> str:
         raise ValueError(f"no token {what!r} (known: {' '.join(TOKENS)})")
     name = name if name == "*" else check_name(name)
     return f"{check_realm(realm)}/{VERSION}/global/{check_name(centre)}/{what}/{name}"
+
+
+def order_key(centre: str, operator: str, realm: str = REALM) -> str:
+    """Key on which an operator gives orders: with certificates nobody else can. `*` stands for any operator. Raises
+    ValueError for what is no name or realm."""
+    return f"{global_key(centre, 'orders', realm)}/{operator if operator == '*' else check_name(operator)}"
 
 
 def truth_key(scenario: str, realm: str = REALM) -> str:

@@ -12,9 +12,11 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
-from fusion_service.bus import Bus, Inbox
+from fusion_service.bus import Bus, Inbox, open_bus
+from fusion_service.bus.security import check_party, maybe_security
 from fusion_service.centre import (
     ClockSet,
     Order,
@@ -52,6 +54,7 @@ from schemas import (
     encode,
     global_key,
     local_key,
+    order_key,
     parse_key,
 )
 
@@ -72,14 +75,18 @@ class Arrival(NamedTuple):
 
 
 def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = False) -> None:
-    """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `StateError` or `ConfigError`,
-    which says in one line why it cannot start."""
+    """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `SecurityError`, `StateError`
+    or `ConfigError`, which says in one line why it cannot start."""
     try:
         begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
         raise ConfigError([f"[service] compiled: {error}"]) from None
+    security = maybe_security(config.bus.security)
+    if security is not None:
+        check_party(security, ("centre",), config.centre.name)
     with open_state(config.service.state) as state:
-        succeed(config, state, stop, Service, standby)
+        join = partial(open_bus, config.bus.connect, stop=stop, security=security)
+        succeed(config, state, stop, join, Service, standby)
 
 
 class Service:
@@ -154,7 +161,8 @@ class Service:
             bus.watch(global_key(centre, "alive", realm), self._tokens.note)
             bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
-        bus.answer(global_key(name, "orders", realm), self._desk.answer)
+        bus.answer(global_key(name, "orders", realm), self._on_order)
+        bus.answer_each(order_key(name, "*", realm), lambda key, asked: self._on_order(asked, key.rsplit("/", 1)[1]))
         bus.announce(global_key(name, "alive", realm))
 
     def _wake_at(self, stop: threading.Event) -> None:
@@ -171,6 +179,9 @@ class Service:
 
     def _on_miss(self, key: str, count: int) -> None:
         self._counts["missed"] += count
+
+    def _on_order(self, payload: bytes | None, operator: str = "") -> bytes:
+        return self._tenure.ordered(payload, operator) or self._desk.answer(payload, operator)
 
     def _on_picture(self, payload: bytes | None) -> bytes:
         if self._result is None:

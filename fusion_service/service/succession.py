@@ -10,10 +10,10 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from typing import Protocol
 
-from fusion_service.bus import Bus, open_bus
+from fusion_service.bus import Bus
 from fusion_service.config import ServiceConfig
 from fusion_service.service.standby import Standby
 from fusion_service.service.state import State
@@ -37,20 +37,22 @@ def succeed(
     config: ServiceConfig,
     state: State,
     stop: threading.Event,
+    join: Callable[[], AbstractContextManager[Bus]],
     make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
     standby: bool,
 ) -> None:
-    """Run as what the process is, one part after the other, until `stop` is set. make: the service on an open bus.
-    Raises what `open_bus` and `make` do."""
-    with open_bus(config.bus.connect, stop=stop) as probe:
+    """Run as what the process is, one part after the other, until `stop` is set. join: opens a session on the bus;
+    make: the service on one. Raises what they do."""
+    with join() as probe:
         while not stop.is_set():
-            standby = _part(config, state, stop, make, standby, probe)
+            standby = _part(config, state, stop, join, make, standby, probe)
 
 
 def _part(
     config: ServiceConfig,
     state: State,
     stop: threading.Event,
+    join: Callable[[], AbstractContextManager[Bus]],
     make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
     standby: bool,
     probe: Bus,
@@ -65,14 +67,14 @@ def _part(
         why = ""
         if standby:
             heard = stack.enter_context(ExitStack())
-            waiting = Standby(config, heard.enter_context(open_bus(config.bus.connect, stop=stop)), probe, state)
+            waiting = Standby(config, heard.enter_context(join()), probe, state)
             heard.callback(waiting.join)
             heritage = waiting.wait(stop)
             if heritage is None:
                 return True
             state.inherit(heritage.checkpoint, heritage.ended, heritage.generation, heritage.epoch)
             why = f"took over: {heritage.why}"
-        bus = stack.enter_context(open_bus(config.bus.connect, stop=stop))
+        bus = stack.enter_context(join())
         service = make(config, bus, state, Tenure(config, bus, probe, why))
         service.run(stop, _hand_on(waiting, service, heard, stack) if waiting is not None else None)
     return True

@@ -6,10 +6,10 @@ long), or has lost the hub while another stands by, asks the hub for the tokens 
 hub has told them, its own among them, and within that time. Clocks that go on while a machine sleeps tell. The hub is
 asked on a session that watches no tokens: one that does would answer from what it heard before it was frozen.
 
-Those who stand by ask `.../state`: for a sign of life, with which they say how far they have come; for a checkpoint, a
-part at a time, which is made between two steps; or, for an operator, to hand over: then the last step is published, a
-checkpoint held ready for who cannot follow, `yields/{term}.{step}` announced, and no step made any more; should nobody
-have taken over in `HANDOVER` seconds, it goes on.
+Those who stand by ask `.../state`: for a sign of life, with which they say how far they have come; or for a checkpoint,
+a part at a time, which is made between two steps. An operator may order to hand over: then the last step is published,
+a checkpoint held ready for who cannot follow, `yields/{term}.{step}` announced, and no step made any more; should
+nobody have taken over in `HANDOVER` seconds, it goes on.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ LOOK = 2.0
 FRESH = 2.0
 """Seconds for which one that stands by is there after it was heard."""
 MOST = 8
+MOST_BYTES = 1000
 TOLD = 600.0
 """Seconds for which the status tells of what has happened."""
 
@@ -159,20 +160,30 @@ class Tenure:
         log.warning("%s", text)
 
     def _answer(self, payload: bytes | None) -> bytes:
-        raw = msgpack.unpackb(payload) if payload and len(payload) < 1000 else {}
+        raw = msgpack.unpackb(payload) if payload and len(payload) < MOST_BYTES else {}
         asked = raw if isinstance(raw, dict) else {}
         what, name = asked.get("what"), str(asked.get("name", ""))[:64]
         answer: dict[str, Any] = {"term": self.term, "epoch": self._epoch, "step": self._step, "time": self._time}
         answer |= {"generation": self._generation, "age": max(0.0, seconds() - self._passed)}
-        if what == "handover":
-            answer |= self._hand_over(str(asked.get("who", ""))[:64])
-        elif what in ("sign", "state"):
+        if what in ("sign", "state"):
             self._note(name, asked)
             with self._lock:
                 answer["nodes"] = {name: one.node for name, one in self._followers.items()}
             if what == "state":
                 answer |= self._part(name, asked.get("part"))
         return cast(bytes, msgpack.packb(answer))
+
+    def ordered(self, payload: bytes | None, operator: str) -> bytes | None:
+        """The answer to an order to hand over, None for any other. operator: on whose key it came."""
+        if not payload or len(payload) > MOST_BYTES or b"handover" not in payload:
+            return None
+        try:
+            raw = msgpack.unpackb(payload)
+        except Exception:  # whoever reads it next says what is wrong
+            return None
+        if not isinstance(raw, dict) or raw.get("what") != "handover":
+            return None
+        return cast(bytes, msgpack.packb(self._hand_over(operator or str(raw.get("who", ""))[:64])))
 
     def _note(self, name: str, asked: dict[str, Any]) -> None:
         node, step, takeover = asked.get("node"), asked.get("step"), asked.get("takeover")

@@ -18,7 +18,8 @@ NONE = np.zeros(0, dtype=np.uint64)
 @given(st.lists(st.tuples(st.integers(0, NODES - 1), st.integers(0, 3), st.booleans()), max_size=40))
 def test_processes_that_do_not_hear_each_other_never_take_the_same(takes: list[tuple[int, int, bool]]) -> None:
     """Each has its own node; some hear of the greatest generation before they take one, some do not."""
-    last, seconds, taken = [0] * NODES, 1000, []
+    last, seconds = [0] * NODES, 1000
+    taken: list[int] = []
     for node, passed, hears in takes:
         seconds += passed
         last[node] = generation_after(max(last) if hears else last[node], node, seconds)
