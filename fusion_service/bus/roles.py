@@ -8,7 +8,7 @@ token. Who reads may subscribe, look for tokens, and ask publishers for samples 
 | role | owns | reads |
 |---|---|---|
 | source | `local/{name}/**` | nothing |
-| centre | `global/{name}/**`, the queryables `picture`, `orders` and `state` | `local/**`, `global/**`, its own `state` |
+| centre | `global/{name}/**`, queryables `picture`, `orders`, `state` | `local/**`, `global/**`, its own `state` |
 | recorder | nothing | everything but questions and answers |
 | viewer | nothing | `global/**`; asks for `picture` |
 | operator | nothing | as a viewer; gives orders on `global/*/orders/{name}` alone |
