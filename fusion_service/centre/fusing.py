@@ -16,11 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
-from fusion_service.centre.correlation import AUTO, Correlation, Ways
+from fusion_service.centre.bounding import union_bound
+from fusion_service.centre.correlation import AUTO, BY_UNION, Correlation, Ways
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown
@@ -56,7 +57,7 @@ def fuse_all(
     influence = np.where(tracks.link != NO_TRACK, 0.0, np.nan)
     linked = linked if left is None else linked & ~left
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
-    chosen = np.flatnonzero(used)
+    chosen = marked(used)
     lineage, way = picture.lineage.copy(), picture.way.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
@@ -73,7 +74,7 @@ def fuse_all(
         if config.memory == "recursive":
             old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
-                _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound, unknown)
+                _remember(one, spread, gains, picture, at, marked(some), bound, unknown)
         state_time[at], way[at] = time, by
         states.append((one, spread))
         lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory == "recursive")
@@ -151,13 +152,22 @@ class Ruled:
             one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
             bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
             if bad.any():
-                one[:, bad], spread[:, :, bad] = uniform_ci(x[:, :, bad], P[:, :, :, bad])
+                self._mend(one, spread, bad, bad & ((by[at] == BY_UNION) | (name == "cu")), x, P)
                 gains[:, bad] = 1.0 / len(x)
-                self.journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
             return one, spread, gains
 
         information = name == AUTO or RULES[name].information
         return fuse_known(means, covariances, weights, self.unknown, information, rule)
+
+    def _mend(self, one: Floats, spread: Floats, bad: Bools, union: Bools, x: Floats, P: Floats) -> None:
+        """Put what is conservative for the rule in the place of what it could not fuse, and say so: equal-weight
+        intersection, or where all is to be covered, of `union`, what is above all."""
+        rest = bad & ~union
+        one[:, rest], spread[:, :, rest] = uniform_ci(x[:, :, rest], P[:, :, :, rest])
+        if union.any():
+            one[:, union], spread[:, :, union] = union_bound(x[:, :, union], P[:, :, :, union])
+            self.journal.event({"kind": "union-bound", "tracks": int(union.sum())})
+        self.journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
 
     def kin(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
         """Groups whose rows have data in common (see `kinship`): what is derived of rows holds for no result of
@@ -203,7 +213,7 @@ def _as_mixtures(
     with np.errstate(invalid="ignore"):  # of sources that rule each other out there is no mass left
         mean, covariance = parts.moments()
     sound = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
-    several[np.flatnonzero(several)[~sound]] = False
+    several[marked(several)[~sound]] = False
     return parts.take(sound), several
 
 
@@ -254,7 +264,7 @@ def with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]])
         size = len(parts.log_weights)
         log_weight[:size, at] = parts.log_weights
         means[:, :size, at], covariances[:, :, :size, at] = parts.means, parts.covariances
-    needed = int(np.flatnonzero(np.isfinite(log_weight).any(axis=1))[-1]) + 1 if log_weight.shape[1] else 0
+    needed = int(marked(np.isfinite(log_weight).any(axis=1))[-1]) + 1 if log_weight.shape[1] else 0
     if needed <= 1:
         columns = no_parts(len(picture.mean), len(picture.id))
     else:

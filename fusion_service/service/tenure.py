@@ -104,7 +104,7 @@ class Tenure:
         self._newer = 0
         self._lower: set[int] = set()
         self._doubt = self._accompanied = self._handing = False
-        self._passed = self._asked = seconds()
+        self._passed = self._asked = self._round = seconds()
         self._step = self._time = -1
         self._epoch = self._generation = 0
         self._said: tuple[str, float] = (why, seconds())
@@ -164,7 +164,7 @@ class Tenure:
         asked = raw if isinstance(raw, dict) else {}
         what, name = asked.get("what"), str(asked.get("name", ""))[:64]
         answer: dict[str, Any] = {"term": self.term, "epoch": self._epoch, "step": self._step, "time": self._time}
-        answer |= {"generation": self._generation, "age": max(0.0, seconds() - self._passed)}
+        answer |= {"generation": self._generation, "age": max(0.0, seconds() - self._round)}
         if what in ("sign", "state"):
             self._note(name, asked)
             with self._lock:
@@ -234,6 +234,7 @@ class Tenure:
 
     def goes_on(self, centre: Centre, stop: threading.Event) -> bool:
         """Come by once a round: hand out what was asked for. Whether the process is still the active one."""
+        self._round = seconds()
         handing = self._handing and self.may_publish()
         if (self._wanted or handing) and self._step >= 0:
             with self._lock:
@@ -246,7 +247,7 @@ class Tenure:
         return not self._gone()
 
     def may_publish(self) -> bool:
-        """Look, before anything is published, whether the name is still this process' own."""
+        """Look, before anything is published, whether the name is still this process' own. On any thread."""
         now = seconds()
         if now - self._passed < OFTEN:
             return not (self._doubt and self._probe is not None) and not self._newer
