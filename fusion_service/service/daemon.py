@@ -13,6 +13,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -354,8 +355,9 @@ class Service:
                 skipped=self._times.skipped,
                 overload=None if since is None else time.monotonic() - since,
                 busy=busy,
-                tenure=self._tenure,
+                more=self._tenure.notes(),
             )
+            status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
             self._put("status", encode(status))
             self._heart.beat()
         return status

@@ -10,7 +10,6 @@ from typing import Any
 
 from fusion_service.bus import Inbox
 from fusion_service.compiled import road
-from fusion_service.service.tenure import Tenure
 from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
@@ -62,12 +61,11 @@ class StatusMaker:
         skipped: int,
         overload: float | None = None,
         busy: float = 0.0,
-        tenure: Tenure | None = None,
+        more: tuple[str, ...] = (),
     ) -> Status:
         """The status now. last: the centre's own, of its newest step; refused: by reason; alive: whether each source is
         there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not;
-        busy: for which its loop has been at one thing, 0: it says this itself; tenure: the process' hold of the
-        centre's name."""
+        busy: for which its loop has been at one thing, 0: it says this itself; more: notes."""
         uptime = time.monotonic() - self._started
         counts, now = self.counts, time.time_ns()
         recent, span = counts - self._before, max(uptime - self._before_at, 1e-3)
@@ -109,9 +107,7 @@ class StatusMaker:
             },
             road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            notes=self._notes(last, skipped, overload, busy, tenure.notes() if tenure is not None else ()),
-            term=tenure.term if tenure is not None else None,
-            standby=tenure.numbers() if tenure is not None else None,
+            notes=self._notes(last, skipped, overload, busy, more),
         )
 
     def _notes(
