@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from fusion_service.errors import FusionError
 from fusion_service.service.files import FULL, Files, Notes, opened_folder
+from fusion_service.service.terms import NODES, generation_after
 
 __all__ = ["State", "StateError", "open_state"]
 
@@ -61,6 +62,36 @@ class State:
         self._last = 0
         self._unwritten = ""
         self._unsaved = ""
+        self._heritage: tuple[bytes | None, NDArray[np.uint64]] | None = None
+        self._inherits = False
+        self.node = self._kept_node() or 0
+        """This process' own among those that give ids under one centre's name (see `terms`)."""
+        self.epoch_above = 0
+        """Runs of the centre begin after this, ns."""
+
+    def _kept_node(self) -> int | None:
+        try:
+            return int(self._files.read("node") or b"") % NODES if self._files is not None else None
+        except (OSError, ValueError):
+            return None
+
+    @property
+    def has_node(self) -> bool:
+        """Whether it was settled once, beside another process."""
+        return self._kept_node() is not None
+
+    def keep_node(self, node: int) -> None:
+        """From now on this process gives ids as `node`, over restarts too."""
+        self.node = node
+        if self._files is not None:
+            self._files.replace("node", f"{node}\n".encode(), sync=True)
+
+    def inherit(self, checkpoint: bytes | None, ended: NDArray[np.uint64], generation: int, epoch: int) -> None:
+        """A service begins next that goes on where another one was: with this checkpoint instead of the own, without
+        the tracks that have `ended` since, and above that one's generation and epoch."""
+        if checkpoint is not None:
+            self._heritage, self._inherits = (checkpoint, ended), True
+        self._last, self.epoch_above = max(self._last, generation), max(self.epoch_above, epoch)
 
     @property
     def trouble(self) -> str:
@@ -75,7 +106,7 @@ class State:
         last = self._last
         if self._folder is not None:
             last = max(last, self._recorded(above))
-        self._last = max(last + 1, min(above, MOST_GENERATION - 1) + 1, min(_by_clock(), MOST_GENERATION))
+        self._last = generation_after(max(last, min(above, MOST_GENERATION - 1)), self.node, _by_clock())
         if self._files is not None:
             self._record(self._files, f"{self._last:>10}\n".encode())
         return self._last
@@ -110,7 +141,9 @@ class State:
                 self._unwritten = f"{where}: ids are safe, but what is saved is old: make room"
             except OSError:
                 self._unwritten = f"{where}, with no room for a number: ids are safe while the clock is: make room"
-                time.sleep(min(max(self._last + 1 + YEAR_2020 - time.time(), 0.0), 2.0))  # the next start has another
+                time.sleep(
+                    min(max(self._last // NODES + 1 + YEAR_2020 - time.time(), 0.0), 2.0)
+                )  # the next start has another
             log.error("%s", self._unwritten)
             return
         for notes in (self._ended, self._born):
@@ -122,7 +155,9 @@ class State:
                 log.error("%s", self._unwritten)
 
     def load(self) -> bytes | None:
-        """The last checkpoint, if there is one."""
+        """The last checkpoint, or the one inherited, if there is one."""
+        if self._heritage is not None:
+            return self._heritage[0]
         return None if self._files is None else self._files.read("checkpoint")
 
     def set_aside(self, why: str = "refused") -> None:
@@ -148,6 +183,9 @@ class State:
 
     def ended(self) -> NDArray[np.uint64]:
         """The ids that have ended since the last checkpoint was made."""
+        if self._heritage is not None:
+            (_, ended), self._heritage = self._heritage, None
+            return ended
         data = b"" if self._ended is None else self._ended.read()
         ids = np.frombuffer(data[: len(data) // 8 * 8], dtype="<u8").astype(np.uint64)
         return ids[ids > 0]
@@ -159,7 +197,8 @@ class State:
 
     def born(self) -> bytes:
         """What was noted of tracks that have begun since the last checkpoint was made, one note after the other."""
-        return b"" if self._born is None else self._born.read()
+        inherits, self._inherits = self._inherits, False
+        return b"" if self._born is None or inherits else self._born.read()
 
     def note_born(self, note: bytes) -> None:
         """Tracks have begun, which will be published: after kill -9 the note is in `born`. It must end with a byte that

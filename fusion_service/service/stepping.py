@@ -117,7 +117,7 @@ class LastingCentre:
         return self._state.trouble
 
     def _make_centre(self) -> Centre:
-        epoch = time.time_ns()
+        epoch = max(time.time_ns(), self._state.epoch_above + 1)
         self._slept = self._checkpoint is not None
         if self._checkpoint is not None:
             ended, born = (
@@ -158,6 +158,11 @@ class LastingCentre:
             self._since = [one for one in self._since if getattr(one[0], "time", -1) > at]
         self._desk.follow(self.centre)
         return made
+
+    @property
+    def generation(self) -> int:
+        """The upper half of the ids that are given now."""
+        return self._generation
 
     def save(self, *, at_once: bool = False) -> None:
         """Save what has changed, where that is due."""
