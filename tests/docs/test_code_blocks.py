@@ -225,9 +225,11 @@ def check_module(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatc
     assert name.startswith(("benchmarks.", "tests.", "fusion_service.rules")), name
     found = importlib.util.find_spec(name)
     assert found is not None, name
-    assert found.origin is not None, name
     package = found.submodule_search_locations is not None
-    files = sorted(Path(found.origin).parent.glob("*.py")) if package else [Path(found.origin)]
+    files = [Path(found.origin)] if found.origin is not None and not package else []
+    for folder in found.submodule_search_locations or ():
+        files += sorted(Path(folder).glob("*.py"))
+    assert files, name
     if not any("argparse" in file.read_text("utf-8") for file in files):
         assert arguments == [], name
         return
