@@ -32,6 +32,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "standby",
             "security",
             "arrival",
             "judgement",
@@ -41,7 +42,7 @@ SECTIONS = {
             "platforms",
             "extent",
         ),
-        *("tracklets", "late", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
+        *("tracklets", "late", "outages", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "performance", "rules-speed", "reliability"],
     "API": ["api/*"],
