@@ -2,11 +2,11 @@
 
     python -m tests.chaos [--minutes N] [--part NAME ...] [--seed S]
 
-decode: mutated messages through `schemas.decode`; centre: through a real centre under drawn settings; kills: kill -9
-and freezes of hub, service and recorder; disk: full disks; clock: clocks that jump; connections: what each leaves in
-memory; floods: `python -m benchmarks.floods`. The minutes are divided among the parts; what a part reports says what
-was tried. The exit code is 1 if anything got through. `--part centre --seed S` begins with the world S, which is how
-one that got through is made again.
+decode: mutated messages through `schemas.decode`; centre: through a real centre under drawn settings; orders: mutated
+orders through the desk and a centre; kills: kill -9 and freezes of hub, service and recorder; disk: full disks; clock:
+clocks that jump; connections: what each leaves in memory; floods: `python -m benchmarks.floods`. The minutes are
+divided among the parts, and a part of processes may take longer to end. The exit code is 1 if anything got through.
+`--part centre --seed S` begins with the world S, which is how one that got through is made again.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from tests.chaos.connections import count_connections
 from tests.chaos.decoding import fuzz_decoding
 from tests.chaos.disks import fill_disks
 from tests.chaos.kills import kill_and_freeze
+from tests.chaos.ordering import fuzz_orders
 from tests.chaos.report import Report
 
 __all__ = ["PARTS", "main"]
@@ -43,6 +44,7 @@ def _floods(_seed: int, _until: float) -> Report:
 PARTS: dict[str, Callable[[int, float], Report]] = {
     "decode": fuzz_decoding,
     "centre": fuzz_centres,
+    "orders": fuzz_orders,
     "kills": kill_and_freeze,
     "clock": jump_clocks,
     "disk": lambda _seed, _until: fill_disks(),

@@ -26,7 +26,7 @@ from tests.chaos.mutations import BASES, mutated
 from tests.chaos.report import Report
 from tests.chaos.settings import drawn
 
-__all__ = ["fuzz_centres", "world"]
+__all__ = ["HONEST", "fuzz_centres", "honest", "look", "world"]
 
 HOME = np.array([[60_000.0, 0.0, 5.0, 0.0], [64_000.0, 0.0, 0.0, 5.0], [60_000.0, 9000.0, -4.0, 3.0]])
 """Honest targets, far from what the others tell of."""
@@ -98,12 +98,12 @@ def _fly(config: CentreConfig, evil: dict[int, list[Item]], again: bool) -> tupl
             centre, fault = make_centre(config, centre.checkpoint(), generation=7)
             if fault:
                 raise Escape(f"the checkpoint is not read: {fault}")
-        for name, event, received in [*evil.get(second, ()), *_honest(config, second)]:
+        for name, event, received in [*evil.get(second, ()), *honest(config, second)]:
             _give(centre, name, event, received)
         begin = time.process_time()
         try:
             result = centre.step(now)
-            _look(result)
+            look(result)
             if second % 4 == 0:
                 centre.checkpoint()
         except Exception:
@@ -126,7 +126,7 @@ def _give(centre: Centre, name: str, event: Any, received: int) -> None:
     centre.handle(event, received)
 
 
-def _look(result: StepResult) -> None:
+def look(result: StepResult) -> None:
     """What comes out is written, and read as it was."""
     for message in (result.tracks, result.log, result.status, result.picture):
         data = schemas.encode(message)
@@ -134,7 +134,8 @@ def _look(result: StepResult) -> None:
             raise Escape(f"the {message.type} is read as something else")
 
 
-def _honest(config: CentreConfig, second: int) -> Iterator[Item]:
+def honest(config: CentreConfig, second: int) -> Iterator[Item]:
+    """What the honest sources say within a second."""
     now = START + second * SECOND
     for number, name in enumerate(HONEST):
         if second == 1:
