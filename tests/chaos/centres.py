@@ -36,6 +36,8 @@ NEAR = 400.0
 """Metres within which a track is that of a target."""
 SLOW = 2.0
 """Processor seconds that a step may take: of three honest targets, and what two others may send between two steps."""
+UNIONS = ("cu", "aa")
+"""Rules by which a track says all that any of its sources says: should one say "anywhere", so do they."""
 QUIET, LOUD, AFTER = 3, 6, 12
 """Seconds without the others, with them, and when they have gone."""
 Item = tuple[str, Any, int]
@@ -200,7 +202,10 @@ def _targets(result: StepResult, sure: bool) -> set[int]:
         return set()
     at = [picture.space.index(axis) for axis in ("x", "y")]
     there = moved(HOME, (picture.time - START) / SECOND)[:, :2]
-    near = np.linalg.norm(picture.means[:, None, at] - there, axis=2) < NEAR
+    off = picture.means[:, None, at] - there
+    near = np.linalg.norm(off, axis=2) < NEAR
+    if not sure and picture.rule in UNIONS:
+        near |= (off**2 < 25.0 * picture.covariances[:, None, at, at]).all(axis=2)
     if sure:
         near &= (picture.covariances[:, at, at].max(axis=1) < (NEAR / 4) ** 2)[:, None]
     return set(np.flatnonzero(near.any(axis=0)).tolist())

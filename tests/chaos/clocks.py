@@ -9,7 +9,8 @@ import random
 import time
 
 from tests.chaos.report import Report
-from tests.chaos.scene import TARGETS, product
+from tests.chaos.scene import TARGETS, Product, Watch, product
+from tests.helpers.processes import eventually
 from tests.helpers.scene import SENSOR
 
 __all__ = ["jump_clocks"]
@@ -37,43 +38,42 @@ def jump_clocks(seed: int, until: float, most: int = 2 * len(JUMPS)) -> Report:
     rng = random.Random(seed)
     cases = [(alone, jump) for jump in JUMPS for alone in (False, True)]
     rng.shuffle(cases)
-    everyone = ("service", "r1", "r2")
-    silence, back = 0.0, 0.0
     with product(program=("-c", SERVICE)) as (all_of, watch):
         for name in ("r1", "r2"):
             all_of.add(name, "-c", SHIFTED + SENSOR, all_of.endpoint, name, "given", *map(str, TARGETS))
-        all_of.start(*everyone)
-        kept, shift = {True: [0, 0], False: [0, 0]}, 0.0
-        for number, (alone, jump) in enumerate([(False, 0.0), *cases[:most]]):
-            before, begin = watch.confirmed(), time.monotonic()
-            if begin > until and number:
+        all_of.start("service", "r1", "r2")
+        eventually(watch.whole, 90)
+        shift = 0.0
+        for alone, jump in cases[:most]:
+            if time.monotonic() > until:
                 break
-            for name in ("service",) if alone else everyone:
-                all_of[name].tell(str(shift + jump))
-            if alone:
-                time.sleep(STAYS)
-                all_of["service"].tell(str(shift))
-            else:
-                shift += jump
-            changed = time.monotonic()
-            while not (watch.whole(changed + 2.0)) and time.monotonic() - changed < PATIENCE:
-                time.sleep(0.05)
-            who = "of the service alone, and back" if alone else "of all"
-            if not watch.whole():
-                report.escaped(f"a jump {who} by {jump:g} s: the picture is not whole: {watch.confirmed()}")
-            if number:
-                report.tried += 1
-                back, silence = max(back, time.monotonic() - changed), max(silence, watch.silence(begin))
-                kept[alone][0] += sum(watch.confirmed().get(one) == before.get(one) for one in TARGETS)
-                kept[alone][1] += len(TARGETS)
+            _jump(all_of, watch, alone, shift, jump, report)
+            shift += 0.0 if alone else jump
+            report.tried += 1
         if watch.returned or any(len(one) > 1 for one in watch.targets_of.values()):
             report.escaped(f"ids used twice: {watch.returned} {watch.targets_of}")
         code, _ = all_of["service"].end()
         told = all_of["service"].log.read_text(errors="replace")
         if code or "Traceback" in told:
             report.escaped(f"exit code {code}: {told[-2000:]}")
-    report.say(f"jumps from {min(JUMPS):g} to {max(JUMPS):g} s; exit code {code}; longest silence {silence:.2f} s")
-    for alone, (same, all_ids) in kept.items():
-        report.say(f"{'service alone, and back' if alone else 'all clocks'}: ids kept {same} of {all_ids}")
-    report.say(f"whole again after {back:.1f} s at most")
+        report.say(f"exit code {code}")
     return report
+
+
+def _jump(all_of: Product, watch: Watch, alone: bool, shift: float, jump: float, report: Report) -> None:
+    """One jump; what it did is said."""
+    before, begin = watch.confirmed(), time.monotonic()
+    for name in ("service",) if alone else ("service", "r1", "r2"):
+        all_of[name].tell(str(shift + jump))
+    if alone:
+        time.sleep(STAYS)
+        all_of["service"].tell(str(shift))
+    changed = time.monotonic()
+    while not watch.whole(changed + 1.0) and time.monotonic() - changed < PATIENCE:
+        time.sleep(0.05)
+    who = "service alone, and back" if alone else "all clocks"
+    if not watch.whole():
+        report.escaped(f"{who} by {jump:g} s: the picture is not whole: {watch.confirmed()}")
+    kept = sum(watch.confirmed().get(one) == before.get(one) for one in TARGETS)
+    silence, back = watch.silence(begin), time.monotonic() - changed
+    report.say(f"{who} by {jump:g} s: ids kept {kept}, silence {silence:.2f} s, whole again after {back:.1f} s")

@@ -139,7 +139,10 @@ class Watch:
 
     @staticmethod
     def _confirmed(picture: schemas.GlobalTracks) -> dict[int, int]:
-        shown = picture.status == 1
+        """Of tracks that say where they are, to 100 m: one of which nothing is heard may be anywhere."""
+        off = picture.means[:, :2] - np.rint(picture.means[:, :2] / [1000.0, np.inf]) * [1000.0, 0.0]
+        sure = picture.covariances[:, [0, 1], [0, 1]].max(axis=1, initial=0.0) < 100.0**2
+        shown = (picture.status == 1) & sure & (abs(off).max(axis=1, initial=0.0) < 100.0)
         numbers = np.rint(picture.means[shown, 0] / 1000).astype(int).tolist()
         return dict(zip(numbers, picture.ids[shown].tolist(), strict=True))
 

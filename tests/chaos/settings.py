@@ -23,6 +23,8 @@ SPACES = (
     ("x", "y", "vx", "vy", "turn_rate"),
 )
 MOTIONS = ({"kind": "cv", "q": 1.0}, {"kind": "cv", "q": 1e4}, {"kind": "still"}, {"kind": "ca", "q": 0.1})
+LEAST = {"intensity_components": 64}
+"""Below, others take the room of honest ones, as they may."""
 APART = {"name", "space", "motion", "ignore", "source_defaults", "sources", "rule", "memory", "period", "max_future"}
 """Settings that are drawn by themselves, or left alone."""
 
@@ -56,6 +58,7 @@ def _some(rng: random.Random, kind: type[CentreConfig] | type[SourceConfig]) -> 
         if one.name in APART or rng.random() > 0.125:
             continue
         choices = values(one) or [number for number in NUMBERS if _taken(one, number)]
+        choices = [value for value in choices if not value < LEAST.get(one.name, value)]
         if choices:
             some[one.name] = rng.choice(choices)
     return some
