@@ -16,6 +16,7 @@ __all__ = ["EXAMPLE", "HELP", "add", "run"]
 HELP = "Record everything on the bus."
 EXAMPLE = """fusion-service record --out mission.rrd
   fusion-service record --out mission/ --rotate-every 1h --keep-for 7d     parts 0001.rrd, 0002.rrd, ...
+  fusion-service record --out mission.rrd --sign rec.key                   signed: `verify` and others check it
   fusion-service record --live       look on with: rerun --connect rerun+http://127.0.0.1:9876/proxy
   fusion-service record --live-web   look on in a browser"""
 
@@ -44,6 +45,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="TIME",
         help="what a kill may cost at most (default 1s)",
     )
+    parser.add_argument("--sign", metavar="KEY", help="sign the recording with this private key, PEM")
     parser.add_argument("--no-draw", action="store_true", help="record the messages alone, without the picture")
     weeks = parser.add_argument_group("for weeks", "any of these makes the recording a folder of parts")
     for name, kind, metavar, text in (
@@ -85,6 +87,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.recording import Rotation, default_path, run_recorder
     from fusion_service.recording.live import DEFAULT_ADDRESS, Live
     from fusion_service.recording.parts import is_folder
+    from fusion_service.recording.signing import load_signer
 
     limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
     rotation = None
@@ -99,6 +102,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         raise FileExistsError(f"{path} exists already: name another file, or move it away")
     if (args.live or args.live_web) and args.no_draw:
         raise UsageError("--live shows what is drawn: leave out --no-draw")
+    signer = load_signer(Path(args.sign)) if args.sign else None
     with ExitStack() as stack:
         live = None
         if args.live or args.live_web:
@@ -114,6 +118,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             cutoff=args.cutoff,
             draw=not args.no_draw,
             rotation=rotation,
+            signer=signer,
             live=live,
             interval=args.flush,
         )

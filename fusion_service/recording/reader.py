@@ -21,7 +21,7 @@ import shutil
 import tempfile
 import warnings
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -33,7 +33,7 @@ from fusion_service.recording.parts import number_of, parts
 from fusion_service.recording.salvage import HEADER, salvage, whole_part
 from schemas import Message, MessageError, decode
 
-__all__ = ["RawMessage", "has_index", "messages", "read", "recording_id", "repair"]
+__all__ = ["RawMessage", "has_index", "messages", "read", "read_file", "recording_id", "repair", "stored"]
 
 log = logging.getLogger(__name__)
 
@@ -60,7 +60,7 @@ def read(path: str | Path) -> Iterator[RawMessage]:
         return
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
-    for message, _ in _read_file(path):
+    for message, _ in read_file(path):
         yield message
 
 
@@ -79,7 +79,7 @@ def _read_parts(folder: Path) -> Iterator[RawMessage]:
         before, ended, begun = number, last, 0
         begins: list[str] = []
         try:
-            for message, standing in _read_file(path, begins):
+            for message, standing in read_file(path, begins):
                 if standing and infos.get(message.key) == message.data:
                     continue
                 if message.key.endswith("/info"):
@@ -94,14 +94,19 @@ def _read_parts(folder: Path) -> Iterator[RawMessage]:
             log.warning("%s: %.1f s without a recorder before part %d", folder, (begun - ended) / 1e9, number)
 
 
-def _read_file(path: Path, begins: list[str] | None = None) -> Iterator[tuple[RawMessage, bool]]:
-    """Each message, and whether it is repeated from an earlier part. `begins` is told how the part began, as `Recorder`
-    wrote it."""
-    content = ["/raw/**"] if begins is None else ["/raw/**", "/__properties/part"]
+def read_file(
+    path: Path, begins: list[str] | None = None, on_seal: Callable[[Any], None] | None = None
+) -> Iterator[tuple[RawMessage, bool]]:
+    """Each message of one file, with its arrival number there, and whether it is repeated from an earlier part.
+    `begins` is told how the part began, as `Recorder` wrote it; `on_seal` each chunk of seals. Raises as `read`."""
+    content = ["/raw/**", *["/__properties/part"] * (begins is not None), *["/seal/**"] * (on_seal is not None)]
     with tempfile.TemporaryDirectory(prefix="rrd-") as folder:
         waiting: list[tuple[RawMessage, bool]] = []
         following = 0
         for chunk in _chunks(path, Path(folder), content):
+            if on_seal is not None and chunk.entity_path.startswith("/seal/"):
+                on_seal(chunk)
+                continue
             if begins is not None and not chunk.entity_path.startswith("/raw/"):
                 batch = chunk.to_record_batch()
                 if "begins" in batch.schema.names:
@@ -145,6 +150,11 @@ def _torn(path: Path, copy: Path, whole: int) -> Path:
     shutil.copyfile(path, copy)
     os.truncate(copy, whole)
     return copy
+
+
+def stored(path: Path, content: list[str]) -> Iterator[Any]:
+    """The chunks of some entities of a file that opens."""
+    yield from _open(path).stream().filter(content=content)
 
 
 def recording_id(path: Path) -> str:
