@@ -7,7 +7,7 @@ repeats). What came between two flushes is a block; the seal of a block says, as
     number, previous   which seal of the mission, from 0; the hash of the seal before it, of the part before too
     first, count       arrival numbers, in this part, of the messages in the block
     repeated, total    messages at the head of the part that it repeats; messages of the mission until now without such
-    time               when the last message was received, ns UTC
+    time               when the last message was received, ns UTC, 0 before the first
     ends               "" , "part" or "recording": nothing comes after it in the part
     keeps              whether old parts of this mission may be deleted by its recorder
     digests            SHA-256 over the digests of the block, one after the other; they stand beside the seal
@@ -36,11 +36,13 @@ _KINDS = ("", "part", "recording")
 
 
 class Link(NamedTuple):
-    """Where a chain has come to: the number of its last seal, that seal's hash, and messages of the mission."""
+    """Where a chain has come to: the number of its last seal, that seal's hash, messages of the mission, and when the
+    last of them was received."""
 
     number: int = -1
     hash: str = ""
     total: int = 0
+    time: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +85,7 @@ class Seal(NamedTuple):
     @property
     def link(self) -> Link:
         """From where the chain goes on."""
-        return Link(self.statement.number, self.hash, self.statement.total)
+        return Link(self.statement.number, self.hash, self.statement.total, self.statement.time)
 
     @classmethod
     def read(cls, text: Any, digests: Any, signature: Any) -> Seal:
@@ -114,7 +116,8 @@ class Chain:
         self._recording, self._part = recording, part
         self._keeps, self._signer = keeps, signer
         self._digests: list[bytes] = []
-        self._first = self._repeated = self._received = 0
+        self._first = self._repeated = 0
+        self._received = link.time
 
     @property
     def waiting(self) -> int:

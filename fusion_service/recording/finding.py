@@ -99,9 +99,7 @@ class Gathered:
         """asked: whether an authority was given, so that what nobody signed is an alarm too."""
         doubts = self.doubts
         if self.sealed and asked and not doubts and (self.unsigned or not self.signers):
-            doubts = (
-                "not all of it is signed" if self.signers else "not signed, and so by nobody of the authority given"
-            )
+            doubts = "not all of it is signed" if self.signers else "not signed by anybody of the authority given"
         if self.unchecked:
             doubts = "signatures cannot be checked: pip install cryptography"
         if self.sealed and not asked and self.signers:

@@ -152,23 +152,23 @@ class Authority:
     keys: tuple[Any, ...]
 
     def doubts(self, identity: Identity, time: int) -> str:
-        """Why it does not vouch for who signed at `time`, ns UTC; empty if it does."""
+        """Why it does not vouch for who signed at `time`, ns UTC, 0 if that is not known; empty if it does."""
         if not identity.certificates:
             return "" if identity.key in self.keys else "signed by a key that is not the one given (--ca FILE)"
         if identity.key in self.keys:
             return ""
         try:
-            return self._doubts(identity, datetime.fromtimestamp(time / 1e9, UTC))
+            return self._doubts(identity, datetime.fromtimestamp(time / 1e9, UTC) if time else None)
         except (ValueError, TypeError, OverflowError, OSError):
             return "signed by a certificate that cannot be read"
 
-    def _doubts(self, identity: Identity, when: datetime) -> str:
+    def _doubts(self, identity: Identity, when: datetime | None) -> str:
         role = identity.name.partition(":")[0]
         if role in ROLES:
             return f"signed by the certificate of a {role}, and not of a recorder"
         chain = identity.certificates
         for k, one in enumerate(chain):
-            if not one.not_valid_before_utc <= when <= one.not_valid_after_utc:
+            if when is not None and not one.not_valid_before_utc <= when <= one.not_valid_after_utc:
                 return f"signed by a certificate that did not hold at {when:%Y-%m-%d %H:%M} UTC"
             if any(_issued(one, authority) for authority in self.certificates):
                 return ""

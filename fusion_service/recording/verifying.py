@@ -59,7 +59,7 @@ def _check(path: Path, mission: _Mission, where: str, stopped: Callable[[], bool
         raise FileNotFoundError(f"no recording at {path}")
     for patience in (PATIENCE, None):
         part = _Part(mission, where, patience)
-        for message, standing in read_file(path, None, part.chunk):
+        for message, standing in read_file(path, None, part):
             if stopped():
                 raise Stopped("stopped while the recording was compared with its seals")
             part.message(message, standing)
@@ -102,8 +102,12 @@ class _Mission:
         elif link is not None and said.number != link.number + 1:
             missing = max(said.total - said.new - link.total - self.leftover, 0) if new_part else 0
             self.found.missing += missing
-            lost = f"{missing:,} messages missing before {here}, and" if missing else f"chain broken at {here}:"
-            self.found.fault(f"{lost} {max(said.number - link.number - 1, 0):,} seals that were there")
+            seals = f"{max(said.number - link.number - 1, 0):,} seals"
+            self.found.fault(
+                f"{missing:,} messages missing before {here}, with {seals}"
+                if missing
+                else f"chain broken at {here}: {seals} before it are missing"
+            )
         elif link is not None and said.previous != link.hash:
             self.found.fault(f"chain broken at {here}: its seal does not follow on the one before it")
         self.recording, self.link = said.recording, seal.link
@@ -159,12 +163,13 @@ class _Part:
         self._passed: dict[int, str] = {}
         self._signers: dict[str, Identity | None] = {}
         self._named: set[str] = set()
+        self._unchecked: list[Seal] = []
         self._after: list[str] = []
         self._messages = self._next = 0
         self._seen = self._last = -1
         self._ends = ""
 
-    def chunk(self, chunk: Any) -> None:
+    def seals(self, chunk: Any) -> None:
         """A chunk of seals, or of signers."""
         self.late |= self._impatient
         if self.late:
@@ -199,16 +204,22 @@ class _Part:
             return
         number = message.arrival
         if number in self._held or number < self._next:
-            self._later(f"message {number:,}{self._where} is there twice, or has no seal")
+            self._later(f"message {number:,}{self._where} is there twice")
             return
         self._held[number] = _Held(digest(message.received, message.key, message.data, standing), standing)
         self._seen = max(self._seen, number)
         self._advance(False)
 
+    def double(self, message: RawMessage) -> None:
+        """A message whose number was read already."""
+        self._later(f"message {message.arrival:,}{self._where} is there twice")
+
     def finish(self) -> None:
         """All was read."""
         sealed = bool(self._seals or self._passed)
         self._advance(True)
+        for seal in self._unchecked:
+            self._signed(seal, self._signers.get(seal.statement.signer))
         for text in self._after:
             self._found.fault(text)
         self._found.messages += self._messages
@@ -264,7 +275,7 @@ class _Part:
             del self._held[number]
         if len(seal.digests) != DIGEST * said.count or hashlib.sha256(seal.digests).hexdigest() != said.digests:
             self._found.fault(
-                f"chain broken at {at(said.first, self._where, said.time)}: the digests are not the sealed"
+                f"chain broken at {at(said.first, self._where, said.time)}: the digests are not those that were sealed"
             )
             for number in [number for number in self._held if number < said.first + said.count]:
                 del self._held[number]
@@ -296,19 +307,24 @@ class _Part:
             self._found.fault(f"{len(missing):,} messages missing: {some}{span(missing)}{self._where}, {sealed}")
 
     def _signature(self, seal: Seal) -> None:
-        said, found = seal.statement, self._found
-        self._named.add(said.signer)
+        """Check it, or keep it until the signer is read: tools that merge files put what is static at their end."""
+        signer = seal.statement.signer
+        self._named.add(signer)
+        self._found.unsigned |= not signer
+        if signer in self._signers:
+            self._signed(seal, self._signers[signer])
+        elif signer:
+            self._unchecked.append(seal._replace(digests=b""))
+
+    def _signed(self, seal: Seal, identity: Identity | None) -> None:
+        said = seal.statement
         here = at(said.first, self._where, said.time)
-        if not said.signer:
-            found.unsigned = True
-            return
-        identity = self._signers.get(said.signer)
-        if found.unchecked:
+        if self._found.unchecked:
             return
         if identity is None:
-            found.fault(f"chain broken at {here}: the certificate that its seal names is not there")
+            self._found.fault(f"chain broken at {here}: the certificate that its seal names is not there")
         elif not identity.signed(seal.text, seal.signature):
-            found.fault(f"chain broken at {here}: the signature of its seal is not by {identity.name}")
+            self._found.fault(f"chain broken at {here}: the signature of its seal is not by {identity.name}")
         else:
             self._mission.vouched(identity, said.signer, said.time)
 
