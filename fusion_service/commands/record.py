@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import threading
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.commands.arguments import duration, port, size
 from fusion_service.process import argument
 
+if TYPE_CHECKING:
+    from fusion_service.bus.security import Security
+    from fusion_service.recording.signing import Signer
+
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
+
+log = logging.getLogger(__name__)
 
 HELP = "Record everything on the bus."
 EXAMPLE = """fusion-service record --out mission.rrd
@@ -36,6 +44,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help=f"hub to join (default {DEFAULT_ENDPOINT})",
     )
+    parser.add_argument(
+        "--security",
+        metavar="FILE",
+        help="the recorder's certificate, which also signs the recording (see `fusion-service keys`)",
+    )
     parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
     parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
     parser.add_argument(
@@ -45,7 +58,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="TIME",
         help="what a kill may cost at most (default 1s)",
     )
-    parser.add_argument("--sign", metavar="KEY", help="sign the recording with this private key, PEM")
+    parser.add_argument(
+        "--sign", metavar="KEY", help="sign the recording by this private key, PEM, without a certificate"
+    )
     parser.add_argument("--no-draw", action="store_true", help="record the messages alone, without the picture")
     weeks = parser.add_argument_group("for weeks", "any of these makes the recording a folder of parts")
     for name, kind, metavar, text in (
@@ -80,14 +95,30 @@ def _address(text: str) -> tuple[str, int]:
     return address(text)
 
 
+def _signer(key: str | None, security: Security | None) -> Signer | None:
+    """By a key alone, or by the recorder's certificate; where that cannot sign, a recording without a signature is
+    better than none."""
+    from fusion_service.errors import UsageError
+    from fusion_service.recording.signing import load_signer
+
+    if key is not None:
+        return load_signer(Path(key))
+    try:
+        return load_signer(security.key, security.certificate) if security else None
+    except (ImportError, UsageError) as error:
+        log.warning("the recording is not signed: %s", error)
+        return None
+
+
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Record until `stop` is set. Raises `UsageError`, `BusError`, `ReviewError`, ImportError, OSError."""
+    """Record until `stop` is set. Raises `UsageError`, `SecurityError`, `BusError`, `ReviewError`,
+    ImportError, OSError."""
     from fusion_service.bus import open_bus
+    from fusion_service.bus.security import maybe_security
     from fusion_service.errors import UsageError
     from fusion_service.recording import Rotation, default_path, run_recorder
     from fusion_service.recording.live import DEFAULT_ADDRESS, Live
     from fusion_service.recording.parts import is_folder
-    from fusion_service.recording.signing import load_signer
 
     limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
     rotation = None
@@ -102,14 +133,15 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         raise FileExistsError(f"{path} exists already: name another file, or move it away")
     if (args.live or args.live_web) and args.no_draw:
         raise UsageError("--live shows what is drawn: leave out --no-draw")
-    signer = load_signer(Path(args.sign)) if args.sign else None
+    security = maybe_security(args.security)
+    signer = _signer(args.sign, security)
     with ExitStack() as stack:
         live = None
         if args.live or args.live_web:
             live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
             stack.callback(live.close)
             print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
-        bus = stack.enter_context(open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop))
+        bus = stack.enter_context(open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop, security=security))
         run_recorder(
             bus,
             path,

@@ -8,20 +8,19 @@ It needs the package `cryptography` (extra `keys`), imported when first needed.
 from __future__ import annotations
 
 import hashlib
-import stat
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from fusion_service.bus.roles import ROLES
+from fusion_service.bus.security import HUB, check_private
 from fusion_service.errors import UsageError
 from fusion_service.recording.chain import signed_bytes
 
 __all__ = ["Authority", "Identity", "Signer", "fingerprint", "import_cryptography", "load_signer", "read_authority"]
 
 RECORDER = "recorder"
-ROLES = ("source", "centre", "operator", "viewer", "gateway", "scenario", "hub")
-"""Whose certificates, by the beginning of their common name, are not to sign a recording."""
 LONGEST = 64 * 1024
 """Letters of an identity."""
 
@@ -73,8 +72,12 @@ def load_signer(key: Path, certificate: Path | None = None) -> Signer:
     from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat, load_pem_private_key
 
     try:
-        if stat.S_IMODE(key.stat().st_mode) & 0o077:
-            raise UsageError(f"{key}: others may read this private key: chmod 600 {key}")
+        check_private(key)
+    except OSError as error:
+        raise UsageError(f"{key}: cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    try:
         private = load_pem_private_key(key.read_bytes(), None)
         pem = certificate.read_text("ascii") if certificate else ""
     except OSError as error:
@@ -164,7 +167,7 @@ class Authority:
 
     def _doubts(self, identity: Identity, when: datetime | None) -> str:
         role = identity.name.partition(":")[0]
-        if role in ROLES:
+        if role != RECORDER and role in (*ROLES, HUB):  # by the beginning of the common name
             return f"signed by the certificate of a {role}, and not of a recorder"
         chain = identity.certificates
         for k, one in enumerate(chain):
