@@ -47,7 +47,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--security",
         metavar="FILE",
-        help="the recorder's certificate, which also signs the recording (see `fusion-service keys`)",
+        help="the recorder's certificate, which signs the recording too (see `fusion-service keys`)",
     )
     parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
     parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")

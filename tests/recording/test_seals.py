@@ -610,6 +610,7 @@ def test_the_certificate_of_a_security_file_signs(tmp_path: Path, capsys: pytest
     listen = command("hub", "--listen", endpoint, "--security", str(keys / "hub"))
     connect = ["--connect", endpoint, "--security", str(keys / "recorder-rec")]
     with Program(listen), Program(command("record", *connect, "--out", str(out), "--flush", "0.1s")) as recorder:
+        eventually(out.is_file, 30)  # then it has subscribed
         with open_bus([endpoint], security=read_security(keys / "source-radar1")) as bus:
             publisher = bus.publisher(local_key("radar1", "tracks"), cache=200)
             for k in range(50):
