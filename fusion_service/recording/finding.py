@@ -17,11 +17,11 @@ MOST = 20
 class Finding:
     """What was found.
 
-    state: "whole"; "open": whole as far as it is sealed, but not ended by its recorder; "broken"; "doubtful": not
-    broken, but not, or not all of it, signed by whom the authority given vouches for, or signatures could not be
-    checked; "not sealed". messages: that were read; whole: of these, those that are as they were sealed; missing:
-    sealed, and not there; unsealed: after the last seal of a recorder that did not end. faults: the first of `count`.
-    signers: by the names in their certificates, empty without signatures. doubts: why the authority does not vouch.
+    state: "whole"; "open": whole as far as it is sealed, but not ended by its recorder, or not all sealed; "broken";
+    "doubtful": not broken, but not, or not all of it, signed by whom the authority given vouches for, or signatures
+    could not be checked; "not sealed". messages: that were read; whole: of these, those that are as they were sealed;
+    missing: sealed, and not there; unsealed: that no seal stands for. faults: the first of `count`. signers: by the
+    names in their certificates, empty without signatures. doubts: why the authority does not vouch.
     """
 
     state: str
@@ -38,11 +38,12 @@ class Finding:
     @property
     def bad(self) -> bool:
         """Whether it is an alarm."""
-        return self.state in ("broken", "doubtful")
+        return self.state in ("broken", "doubtful") or bool(self.doubts)
 
     def __str__(self) -> str:
         if self.state == "not sealed":
-            return "not sealed: recorded by a version without seals, or by another program"
+            text = "not sealed: recorded by a version without seals, or by another program"
+            return "; ".join([text, *[self.doubts] * bool(self.doubts)])
         said = [*self.faults[:1]]
         if self.count > 1:
             missing = f", {self.missing:,} messages missing in all" if self.missing else ""
@@ -76,6 +77,7 @@ class Gathered:
     open: str = ""
     faults: list[str] = field(default_factory=list)
     signers: list[str] = field(default_factory=list)
+    keys: set[str] = field(default_factory=set)
     doubts: str = ""
     notes: list[str] = field(default_factory=list)
 
@@ -90,23 +92,26 @@ class Gathered:
         if len(self.notes) < MOST and text not in self.notes:
             self.notes.append(text)
 
-    def signed(self, name: str) -> None:
-        """A signature was good."""
+    def signed(self, name: str, key: str) -> None:
+        """A signature was good. key: the fingerprint of whose it is."""
+        self.keys.add(key)
         if len(self.signers) < MOST and name not in self.signers:
             self.signers.append(name)
 
     def told(self, asked: bool) -> Finding:
         """asked: whether an authority was given, so that what nobody signed is an alarm too."""
         doubts = self.doubts
-        if self.sealed and asked and not doubts and (self.unsigned or not self.signers):
+        if not doubts and self.unsigned and (asked or self.signers):
             doubts = "not all of it is signed" if self.signers else "not signed by anybody of the authority given"
         if self.unchecked:
             doubts = "signatures cannot be checked: pip install cryptography"
-        if self.sealed and not asked and self.signers:
+        if len(self.keys) > 1:
+            self.note(f"by {len(self.keys)} different keys")
+        if not asked and self.signers:
             self.note("not compared with an authority (--ca FILE)")
         if self.open:
             self.note(self.open)
-        state = "open" if self.open else "whole"
+        state = "open" if self.open or self.unsealed else "whole"
         if not self.sealed:
             state = "not sealed"
         elif self.count:
@@ -122,7 +127,7 @@ class Gathered:
             count=self.count,
             faults=tuple(self.faults),
             signers=tuple(self.signers),
-            doubts=doubts if self.sealed else "",
+            doubts=doubts,
             notes=tuple(self.notes),
         )
 

@@ -66,9 +66,9 @@ class Sealer:
         rr = import_rerun()
         text, digests = self._chain.close(ends)
         self._link = self._chain.link
-        signature = self._signer.sign(text) if self._signer else b""
         index = rr.TimeColumn("arrival", sequence=[max(self._count - 1, 0)])
         try:
+            signature = self._signer.sign(text) if self._signer else b""
             self._stream.send_columns(CHAIN, [index], _seal(rr, text, digests, signature), strict=True)
         except Exception:
             log.exception("a seal cannot be written")

@@ -16,6 +16,7 @@ from typing import Any
 from fusion_service.bus.roles import ROLES
 from fusion_service.bus.security import HUB, check_private
 from fusion_service.errors import UsageError
+from fusion_service.escape import escaped
 from fusion_service.recording.chain import signed_bytes
 
 __all__ = ["Authority", "Identity", "Signer", "fingerprint", "import_cryptography", "load_signer", "read_authority"]
@@ -124,6 +125,7 @@ class Identity:
         certificates = tuple(x509.load_pem_x509_certificates(pem.encode()))
         names = certificates[0].subject.get_attributes_for_oid(x509.NameOID.COMMON_NAME)
         name = str(names[0].value) if names else certificates[0].subject.rfc4514_string()
+        name = " ".join(escaped(name).split())
         return cls(name, certificates[0].public_key(), certificates)
 
     def signed(self, text: str, signature: bytes) -> bool:

@@ -95,6 +95,8 @@ class _Mission:
             self._begins_late(said)
         elif link is None and self.leftover:
             self.found.note(f"{self.leftover:,} messages before part {said.part} have no seals")
+            self.found.unsealed += self.leftover
+            self.found.unsigned = True
         elif link is None and said.previous:
             self.found.fault(f"chain broken at {here}: the first seal follows on another")
         elif link is not None and new_part and said.number == 0 and not said.previous:
@@ -125,7 +127,7 @@ class _Mission:
 
     def vouched(self, identity: Identity, mark: str, time: int) -> None:
         """Note a good signature, and what the authority says of it."""
-        self.found.signed(identity.name)
+        self.found.signed(identity.name, mark)
         if self._authority is not None and not self.found.doubts:
             key = mark, time // MINUTE
             if key not in self._doubts:
@@ -136,10 +138,9 @@ class _Mission:
         """The finding."""
         if self.found.sealed and not self.ends:
             self.found.open = "not ended by its recorder: it runs, was killed, or the end was cut off"
-            if self.found.unsealed:
-                self.found.open += f"; {self.found.unsealed:,} messages are not sealed"
         elif self.found.sealed and self.folder and self.ends == "part":
             self.found.open = "a part that followed is not there, or its recorder was killed just then"
+        self.found.unsigned |= not self.found.sealed
         return self.found.told(self._authority is not None)
 
 
@@ -231,7 +232,9 @@ class _Part:
         self._found.sealed = True
         if self._held and self._ends:
             self._found.fault(f"{len(self._held):,} messages{self._where} stand after its end: {span(self._held)}")
-        self._found.unsealed += 0 if self._ends else len(self._held)
+        elif self._held:
+            self._found.unsealed += len(self._held)
+            self._found.note(f"{len(self._held):,} messages{self._where} are not sealed: {span(self._held)}")
         self._mission.leftover = sum(not held.standing for held in self._held.values())
         self._mission.ends = self._ends
         if len(self._named) > 1:
