@@ -69,9 +69,10 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     try:
         truths = read_truth(Path(args.truth)) if args.truth else []
         for path in map(Path, args.recordings):
-            seals.append(tell(str(path), args.ca, stop))
             cutoff = args.cutoff or (done[0].c if done else None)
-            done.append(_assess(path, truths, cutoff, args, stop))
+            scored = _assess(path, truths, cutoff, args, stop)
+            seals.append(tell(str(path), args.ca, stop))
+            done.append(scored)
     except Stopped:
         print(f"stopped: {len(done)} of {len(args.recordings)} recordings are scored")
     if not done:
