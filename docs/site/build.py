@@ -32,6 +32,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "standby",
             "security",
             "arrival",
             "judgement",
@@ -43,7 +44,7 @@ SECTIONS = {
         ),
         *("tracklets", "late", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
     ],
-    "How good, how fast": ["measurements", "worlds", "studies", "performance", "rules-speed"],
+    "How good, how fast": ["measurements", "worlds", "studies", "performance", "rules-speed", "reliability"],
     "API": ["api/*"],
     "Carry it on": ["architecture", "threats", "decisions/README", "contributing", "changelog"],
 }

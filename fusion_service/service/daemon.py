@@ -12,6 +12,9 @@ import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from fusion_service.bus import Bus, Inbox, open_bus
@@ -30,12 +33,15 @@ from fusion_service.centre import (
 from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.heartbeat import Heartbeat
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.overload import Overload, overtaken
 from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker, status_line
 from fusion_service.service.stepping import LastingCentre
+from fusion_service.service.succession import succeed
+from fusion_service.service.tenure import Tenure
 from fusion_service.service.timing import StepTimes
 from fusion_service.service.tokens import Tokens
 from fusion_service.source_words import source_event
@@ -60,6 +66,9 @@ __all__ = ["Service", "run_service"]
 KEPT = 32
 """Pictures and step logs that can be had again by who missed one: the recorder, above all."""
 
+MOST_WAITING = 64 * 2**20
+"""Bytes between bus and centre: `queue` slots of as many each."""
+
 log = logging.getLogger(__name__)
 
 
@@ -71,9 +80,9 @@ class Arrival(NamedTuple):
     received: int
 
 
-def run_service(config: ServiceConfig, stop: threading.Event) -> None:
-    """Run until `stop` is set. Raises `BusError`, `SecurityError`, `StateError` or `ConfigError`, which says in one
-    line why it cannot start."""
+def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = False) -> None:
+    """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `SecurityError`, `StateError`
+    or `ConfigError`, which says in one line why it cannot start."""
     try:
         begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
@@ -81,17 +90,21 @@ def run_service(config: ServiceConfig, stop: threading.Event) -> None:
     security = maybe_security(config.bus.security)
     if security is not None:
         check_party(security, ("centre",), config.centre.name)
-    with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop, security=security) as bus:
-        Service(config, bus, state).run(stop)
+    with open_state(config.service.state) as state:
+        join = partial(open_bus, config.bus.connect, stop=stop, security=security)
+        succeed(config, state, stop, join, Service, standby)
 
 
 class Service:
-    """The service on an open bus, with its state."""
+    """The service on an open bus, with its state; tenure: its hold of the centre's name."""
 
-    def __init__(self, config: ServiceConfig, bus: Bus, state: State) -> None:
+    def __init__(self, config: ServiceConfig, bus: Bus, state: State, tenure: Tenure | None = None) -> None:
         self._config = config
         self._bus = bus
-        self._inbox: Inbox[Arrival | Order] = Inbox(config.bus.queue)
+        self._tenure = tenure or Tenure(config, bus)
+        self._inbox: Inbox[Arrival | Order] = Inbox(
+            config.bus.queue, slot_bytes=max(1, MOST_WAITING // config.bus.queue)
+        )
         self._status = StatusMaker(config.centre.name)
         self._counts = self._status.counts
         self._told = BoundedLog(config.service.log_refusals)
@@ -102,37 +115,68 @@ class Service:
         self._overload = Overload(self._times.patience)
         self._dropped: Counter[str] = Counter()
         self._result: StepResult | None = None
+        self._stepped = False
+        self._status_due = time.monotonic() + config.service.status_period
         self._taken = 0
         """When everything that had come was taken from the inbox, ns."""
+        self._refused: dict[str, int] = {}
+        self._saying = threading.Lock()
+        self._heart = Heartbeat(config.service.status_period, self._say_late)
 
-    def run(self, stop: threading.Event) -> None:
-        """Work until `stop` is set."""
+    def feed(self, source: str, key: str, data: bytes, received: int) -> None:
+        """Take a sample as if it came now: of one that stood by."""
+        self._inbox.put(source, Arrival(key, data, received), len(data))
+
+    def run(self, stop: threading.Event, begun: Callable[[], None] | None = None) -> None:
+        """Work until `stop` is set, or another holds the centre's name. begun: called when all is declared."""
+        self._tenure.begin(self._lasting.generation, self._lasting.centre.epoch, self._inbox.wake)
         self._declare()
+        if begun is not None:
+            begun()
+            self._times.resume(self._lasting.centre.time, time.time_ns())
         threading.Thread(target=self._wake_at, args=(stop,), daemon=True).start()
         notify("READY=1")
         centre = self._config.centre
         rule = centre.rule if centre.kind == "tracks" else f"{centre.intensity_rule} of intensities"
         log.info("fusing by %s, memory %s, every %g s as %s", rule, centre.memory, centre.period, centre.name)
-        status_due = time.monotonic() + self._config.service.status_period
         gc.collect()
         gc.freeze()  # what is loaded stays: it is not looked through again in the middle of a step
-        while not stop.is_set():
-            timeout = max(0.0, status_due - time.monotonic())
-            for item in self._take(min(timeout, self._times.wait(time.time_ns()))):
-                if stop.is_set():
-                    break
-                self._receive(item)
-            changed = self._note_tokens()
-            self._note_drops()
-            self._step_all(stop)
-            self._lasting.save()
-            if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= status_due:
-                status_due = time.monotonic() + self._config.service.status_period
-                notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
-        notify("STOPPING=1")
+        with self._heart:
+            while self._tenure.goes_on(self._lasting.centre, stop) and not stop.is_set():
+                try:
+                    self._turn(stop)
+                except Exception:  # a fault of ours: the next turn may be better
+                    self._counts["failed_turns"] += 1
+                    self._told.error("the loop failed %d times", self._counts["failed_turns"])
+                    stop.wait(0.1)
         self._lasting.save(at_once=True)
+        if not stop.is_set():
+            log.warning("stands down: %s", self._tenure.farewell)
+            return
+        notify("STOPPING=1")
         self._publish_status()
         log.info("stopped after %d steps", self._counts["steps"])
+
+    def _turn(self, stop: threading.Event) -> None:
+        """Take what has come, make a step if one is due, and say how it goes. At most one step between two readings of
+        the inbox."""
+        self._heart.turned()
+        due = min(self._status_due - time.monotonic(), self._wait(), self._tenure.pace)
+        wait = 0.0 if self._stepped else max(0.0, due)
+        for item in self._take(wait):
+            if stop.is_set():
+                break
+            self._receive(item)
+        changed = self._note_tokens()
+        self._note_drops()
+        self._stepped = not stop.is_set() and self._step_due()
+        self._lasting.save()
+        if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= self._status_due:
+            self._status_due = time.monotonic() + self._config.service.status_period
+            notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
+
+    def _wait(self) -> float:
+        return self._times.wait(time.time_ns())
 
     def _declare(self) -> None:
         realm, name, bus = self._config.bus.realm, self._config.centre.name, self._bus
@@ -147,8 +191,8 @@ class Service:
             bus.watch(global_key(centre, "alive", realm), self._tokens.note)
             bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
-        bus.answer(global_key(name, "orders", realm), self._desk.answer)
-        bus.answer_each(order_key(name, "*", realm), lambda key, asked: self._desk.answer(asked, key.rsplit("/", 1)[1]))
+        bus.answer(global_key(name, "orders", realm), self._on_order)
+        bus.answer_each(order_key(name, "*", realm), lambda key, asked: self._on_order(asked, key.rsplit("/", 1)[1]))
         bus.announce(global_key(name, "alive", realm))
 
     def _wake_at(self, stop: threading.Event) -> None:
@@ -165,6 +209,9 @@ class Service:
 
     def _on_miss(self, key: str, count: int) -> None:
         self._counts["missed"] += count
+
+    def _on_order(self, payload: bytes | None, operator: str = "") -> bytes:
+        return self._tenure.ordered(payload, operator) or self._desk.answer(payload, operator)
 
     def _on_picture(self, payload: bytes | None) -> bytes:
         if self._result is None:
@@ -188,7 +235,8 @@ class Service:
     def _receive(self, item: Arrival | Order) -> None:
         if isinstance(item, Order):
             fault = f": {item.refused}" * bool(item.refused)
-            log.info("order %d of %s: %s%s", item.number, item.who or "?", item.what, fault)
+            if self._told.allows(f"orders {item.number % 20}", 1.0):  # twenty lines a second: the step log has them all
+                log.info("order %d of %s: %s%s", item.number, item.who or "?", item.what, fault)
             self._lasting.handle(item, time.time_ns())
             return
         self._counts["messages"] += 1
@@ -229,19 +277,20 @@ class Service:
                 self._dropped[name] = total
                 self._lasting.handle(Refused(name, "queue", new, dropped=True), time.time_ns())
 
-    def _step_all(self, stop: threading.Event) -> None:
-        while not stop.is_set():
-            due = self._times.due(self._taken, self._lasting.centre.time)
-            if due is None:
-                return
-            if skipped := self._times.untold():
-                self._lasting.handle(Skipped(skipped), time.time_ns())
-            if due <= self._lasting.centre.time:
-                self._lasting.handle(ClockSet(due), time.time_ns())
-            if due > self._lasting.centre.time:
-                self._step(due)
-            else:
-                self._warn_behind(due)
+    def _step_due(self) -> bool:
+        """Make the step that is due; whether one was, so that another may be."""
+        due = self._times.due(self._taken, self._lasting.centre.time)
+        if due is None:
+            return False
+        if skipped := self._times.untold():
+            self._lasting.handle(Skipped(skipped), time.time_ns())
+        if due <= self._lasting.centre.time:
+            self._lasting.handle(ClockSet(due), time.time_ns())
+        if due > self._lasting.centre.time:
+            self._step(due)
+        else:
+            self._warn_behind(due)
+        return True
 
     def _warn_behind(self, due: int) -> None:
         """The clock stands before the last step: none is made until it has caught up, or a new era begins."""
@@ -256,7 +305,8 @@ class Service:
         if made is None:
             return
         for what, payload in made.messages.items():
-            self._out[what].put(payload)
+            self._put(what, payload)
+        self._tenure.stepped(made.result.log.step, at, self._lasting.centre.epoch, self._lasting.generation)
         self._status.published(at, time.time_ns())
         notes = made.result.status.notes
         if notes and self._told.allows(notes[0], 600.0):
@@ -265,6 +315,11 @@ class Service:
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
+
+    def _put(self, what: str, payload: bytes) -> None:
+        """Publish it, if this process is still the one that does."""
+        if self._tenure.may_publish():
+            self._out[what].put(payload)
 
     def _tell_sources(self, journal: StepLog) -> None:
         """Say what has changed about sources: how they are trusted, shifted, used: twenty lines a second at most."""
@@ -280,19 +335,38 @@ class Service:
 
     def _publish_status(self) -> Status:
         last = self._result.status if self._result is not None else None
-        centre = self._lasting.centre
-        refused = centre.refusals()
-        self._told.refusals(refused, last.dropped if last is not None else {})
-        status = self._status.make(
-            last,
-            epoch=centre.epoch,
-            inbox=self._inbox,
-            refused=refused,
-            alive=self._tokens.told,
-            skipped=self._times.skipped,
-            overload=None if self._overload.since is None else time.monotonic() - self._overload.since,
-        )
+        self._refused = self._lasting.centre.refusals()
+        self._told.refusals(self._refused, last.dropped if last is not None else {})
+        status = self._say_status()
         if self._overload.since is not None and status.notes:
             self._told.warn("%s", status.notes[0])
-        self._out["status"].put(encode(status))
         return status
+
+    def _say_status(self, busy: float = 0.0) -> Status:
+        """Publish it. busy: seconds for which the loop has been at one thing, where another thread says it."""
+        with self._saying:
+            since = self._overload.since
+            status = self._status.make(
+                self._result.status if self._result is not None else None,
+                epoch=self._lasting.centre.epoch,
+                inbox=self._inbox,
+                refused=self._refused,
+                alive=self._tokens.told,
+                skipped=self._times.skipped,
+                overload=None if since is None else time.monotonic() - since,
+                busy=busy,
+                more=self._tenure.notes(),
+            )
+            status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
+            self._put("status", encode(status))
+            self._heart.beat()
+        return status
+
+    def _say_late(self, busy: float, alive: bool) -> None:
+        """On the heartbeat's thread: the loop is late with the status."""
+        try:
+            status = self._say_status(busy)
+            if alive:
+                notify(f"WATCHDOG=1\nSTATUS={status_line(status)}")
+        except Exception:
+            self._told.error("no status could be published in place of the loop, at one thing for %.0f s", busy)
