@@ -51,7 +51,7 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Score the recordings. Raises `ReviewError`, OSError."""
-    from fusion_service.commands.sealed import tell
+    from fusion_service.commands.sealed import find, say
     from fusion_service.errors import ReviewError, Stopped
     from fusion_service.review.evaluation.results import results, text
     from fusion_service.review.evaluation.truth import read_truth
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         for path in map(Path, args.recordings):
             cutoff = args.cutoff or (done[0].c if done else None)
             scored = _assess(path, truths, cutoff, args, stop)
-            seals.append(tell(str(path), args.ca, stop))
+            seals.append(find(str(path), args.ca, stop))
             done.append(scored)
     except Stopped:
         print(f"stopped: {len(done)} of {len(args.recordings)} recordings are scored")
@@ -84,6 +84,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
         )
     print(text(done))
+    for recording, seal in zip(args.recordings, seals, strict=False):
+        say(recording, seal)
     if args.json:
         scores = results(done)
         for told, seal in zip(scores["recordings"], seals, strict=False):

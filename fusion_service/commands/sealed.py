@@ -1,4 +1,4 @@
-"""What commands that read a recording say of its seals, in one line of the log."""
+"""What commands that read a recording say of its seals, in one line."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fusion_service.recording.finding import Finding
 
-__all__ = ["add_authority", "find", "tell"]
+__all__ = ["add_authority", "find", "say", "tell"]
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +33,14 @@ def find(recording: str, ca: str | None, stop: threading.Event) -> Finding:
     return verify(Path(recording), read_authority(Path(ca)) if ca else None, stop.is_set)
 
 
-def tell(recording: str, ca: str | None, stop: threading.Event) -> Finding:
-    """The same, told in the log; an alarm is a warning, and the command goes on."""
-    found = find(recording, ca, stop)
-    log.log(logging.WARNING if found.bad else logging.INFO, "%s: %s", recording, found)
-    return found
+def tell(recording: str, ca: str | None, stop: threading.Event) -> None:
+    """Find it, and say it."""
+    say(recording, find(recording, ca, stop))
+
+
+def say(recording: str, found: Finding) -> None:
+    """In a line; an alarm is a warning of the log, and the command goes on."""
+    if found.bad:
+        log.warning("%s: %s", recording, found)
+    else:
+        print(f"{recording}: {found}")

@@ -569,10 +569,14 @@ def test_evaluate_tells_of_it(tmp_path: Path, signer: Signer, ca: Ca, capsys: py
     assert main(["evaluate", path, "--json", str(scores), "--ca", str(ca.file)]) == 0
     seal = json.loads(scores.read_text())["recordings"][0]["seal"]
     assert (seal["state"], seal["signers"], seal["missing"]) == ("whole", ["recorder:rec"], 0)
-    assert f"INFO    {path}: {seal['text']}" in capsys.readouterr().err
+    assert f"{path}: {seal['text']}\n" in capsys.readouterr().out
     for command in (["explain", path], ["export", path, "--out", str(tmp_path / "a.csv")]):
         assert main([*command, "--ca", str(ca.file)]) == 0
-        assert f"INFO    {path}: {seal['text']}" in capsys.readouterr().err
+        assert f"{path}: {seal['text']}\n" in capsys.readouterr().out
+    held = take(Path(path))
+    changed = put(tmp_path / "changed.rrd", with_message(held, 7, received=held.messages[7].received + 1))
+    assert main(["evaluate", str(changed)]) == 0
+    assert f"WARNING {changed}: chain broken at message 7, " in capsys.readouterr().err
 
 
 HOSTILE = ["", "{}", "[]", "1", "[" * 3000, '{"recording":1}', json.dumps({"a": "x" * 5000})]
