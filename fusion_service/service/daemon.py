@@ -355,7 +355,7 @@ class Service:
                 skipped=self._times.skipped,
                 overload=None if since is None else time.monotonic() - since,
                 busy=busy,
-                more=self._tenure.notes(),
+                more=(*self._tenure.notes(), *filter(None, [self._lasting.alarm])),
             )
             status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
             self._put("status", encode(status))
