@@ -648,7 +648,7 @@ def test_a_part_by_another_hand_is_told(signer: Signer, authority: Authority, ke
     before = tmp_path / "before"
     before.mkdir()
     shutil.copy(tmp_path / "m" / "0001.rrd", before / "0002.rrd")
-    shutil.copy(Path(__file__).parents[1] / "recordings" / "memory.rrd", before / "0001.rrd")
+    shutil.copy(Path(__file__).parents[1] / "recordings" / "0.1.0" / "memory.rrd", before / "0001.rrd")
     found = verify(before)
     assert (found.state, found.whole, found.messages - found.unsealed) == ("doubtful", COUNT, COUNT)
 
