@@ -26,13 +26,13 @@ class ArrivalClock:
     of them are followed; where nothing comes there is no step.
     """
 
-    def __init__(self, config: CentreConfig) -> None:
+    def __init__(self, config: CentreConfig, authenticated: bool = False) -> None:
         self._config = config
         self._spacing = round(config.arrival_spacing * 1e9)
         self._lateness = round(config.lateness * 1e9)
         self._back = round((config.delay + config.period) * 1e9)
         self._margin = margin(config)
-        self._messages = MessageClock(config) if config.clock == "message" else None
+        self._messages = MessageClock(config, authenticated) if config.clock == "message" else None
         self._grid = WallClock(config)
         self._waiting: list[int] = []
         self._free = -1
@@ -66,7 +66,7 @@ class ArrivalClock:
         else:
             self._follow()
         if not self._free - self._spacing <= now < self._free:
-            newest = self._newest(now if self._messages is None else None)
+            newest = self._newest(now if self._messages is None else self._messages.limit())
             if newest is not None and (at := self._step_for(newest, last)) is not None:
                 self._free = now + self._spacing
                 return at
@@ -74,7 +74,8 @@ class ArrivalClock:
 
     def wait(self, now: int) -> float:
         """Seconds until a step may be due without anything new; infinite where none will be."""
-        at = max(self._waiting[0], self._free) if self._waiting else None
+        waits = self._waiting and (self._messages is None or self._waiting[0] <= self._messages.limit())
+        at = max(self._waiting[0], self._free) if waits else None
         until = float("inf") if at is None else max(0.0, (at - now) / 1e9)
         return until if self._messages is not None else min(until, self._grid.wait(now))
 
@@ -84,10 +85,10 @@ class ArrivalClock:
         while self._messages.due() is not None:
             pass
 
-    def _newest(self, now: int | None) -> int | None:
-        """The newest of the scans that wait, which wait no more; None for none. now: only those until then."""
+    def _newest(self, now: int) -> int | None:
+        """The newest of the scans that wait and hold until `now`, which wait no more; None for none."""
         newest = None
-        while self._waiting and (now is None or self._waiting[0] <= now):
+        while self._waiting and self._waiting[0] <= now:
             newest = heapq.heappop(self._waiting)
         return newest
 

@@ -55,9 +55,9 @@ __all__ = [
 ]
 
 
-LATER = ("trigger", "arrival_spacing", "revise", "weights", "compiled")
+LATER = ("trigger", "arrival_spacing", "revise", "weights", "compiled", "clock_votes")
 """Settings that came after hashes were recorded; their defaults are what there was before, or `BEFORE` says."""
-BEFORE: dict[str, Any] = {"revise": 0.0, "weights": "best"}
+BEFORE: dict[str, Any] = {"revise": 0.0, "weights": "best", "clock_votes": "all"}
 """What stands where recorded settings do not say them."""
 
 
@@ -131,6 +131,12 @@ class CentreConfig:
     frame: Frame | None = _setting(None, read_frame, "frame of the picture; left out: what sources agree on")
     frame_wait: float = _setting(5.0, DURATION, "seconds after which the most supported frame is taken")
     clock: str = _setting("wall", choice("wall", "message"), "step by wall clock, or by the messages' own time")
+    clock_votes: str = _setting(
+        "auto",
+        choice("auto", "configured", "all"),
+        "whose messages move the clock of the messages: sources with a table here, or all; auto: those with a table, "
+        "where there are any and no certificates",
+    )
     trigger: str = _setting(
         "period", choice("period", "arrival"), "step every period, or as soon as a scan is in, at the scan's time"
     )
