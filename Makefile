@@ -48,7 +48,7 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "Setting up $(VENV) (once, about a minute) ..."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install -q -e '.[record,report,dev,fast]'
+	$(BIN)/pip install -q -e '.[record,report,dev,fast,keys]'
 	$(BIN)/python -m fusion_service.compiled
 	touch $@
 

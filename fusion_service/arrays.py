@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Ints", "among", "find_sorted", "from_bytes", "picked", "subset", "to_bytes"]
+__all__ = ["Bools", "Floats", "Ints", "among", "find_sorted", "from_bytes", "marked", "picked", "subset", "to_bytes"]
 
 Number = TypeVar("Number", bound=np.generic)
 Floats = NDArray[np.float64]
@@ -19,6 +19,8 @@ SHORT = 4
 """Values that are compared one by one."""
 FEW = 64
 """Below, a search is quicker than a table."""
+SMALL = 4096
+"""Comparisons of each with each, up to which they are quicker than sorting."""
 SPARSE = 8
 """Numbers of the span of ids for each of them, up to which a table is worth its room."""
 
@@ -26,10 +28,10 @@ SPARSE = 8
 def find_sorted(ids: NDArray[np.uint64], some: NDArray[np.uint64]) -> Ints:
     """`np.searchsorted(ids, some)` for ids in order: where these lie close together by a table, ten times as fast."""
     if len(some) < FEW or not len(ids):
-        return np.searchsorted(ids, some)
+        return ids.searchsorted(some)
     first, last = int(ids[0]), int(ids[-1])
     if not 0 <= last - first < SPARSE * (len(ids) + len(some)) or last == 2**64 - 1:
-        return np.searchsorted(ids, some)
+        return ids.searchsorted(some)
     before = np.zeros(last - first + 2, dtype=np.intp)
     before[(ids - np.uint64(first)).astype(np.intp) + 1] = 1
     return before.cumsum()[(np.clip(some, np.uint64(first), np.uint64(last + 1)) - np.uint64(first)).astype(np.intp)]
@@ -41,11 +43,20 @@ def among(values: NDArray[np.integer[Any]], some: NDArray[np.integer[Any]]) -> B
     if not len(some) or not len(values):
         return np.zeros(len(values), dtype=np.bool_)
     if len(some) > SHORT:
-        return np.isin(values, some)
+        if len(values) * len(some) > SMALL:
+            return np.isin(values, some)
+        return np.asarray((values[:, None] == some).any(axis=1))
     found: Bools = values == some[0]
     for one in some[1:]:
         found |= values == one
     return found
+
+
+def marked(mask: Any) -> Ints:
+    """`np.flatnonzero(mask)` of a flat array (K,), without what that does beside it, which is most of it where rows are
+    few."""
+    at: Ints = mask.nonzero()[0]
+    return at
 
 
 def picked(array: NDArray[Number], rows: Any) -> NDArray[Number]:
@@ -53,7 +64,7 @@ def picked(array: NDArray[Number], rows: Any) -> NDArray[Number]:
     done with it then is a line of the cache away from the next."""
     if not isinstance(rows, np.ndarray):
         return array[..., rows]
-    return array.take(np.flatnonzero(rows) if rows.dtype == np.bool_ else rows, axis=-1)
+    return array.take(rows.nonzero()[0] if rows.dtype == np.bool_ else rows, axis=-1)
 
 
 def subset(array: NDArray[Number], rows: Ints) -> NDArray[Number]:

@@ -7,6 +7,7 @@ FusionError                           1  the root; in `schemas.errors`, for `sch
   MessageError            ValueError  1  schemas: a message that cannot be read or written
   BusError                            1  fusion_service.bus: an endpoint, a key, a hub that is not there
     BusStopped            Stopped     0  fusion_service.bus: stopped while it waited for the hub
+  SecurityError                       2  fusion_service.bus: a security file, certificate or key that is no good
   StateError                          1  fusion_service.service.state: the folder of ids and checkpoint
   CheckpointError         ValueError  1  fusion_service.centre.checkpoint: a checkpoint that cannot be gone on from
   DemoError                           1  fusion_service.demo: a mission that cannot be flown, or went wrong

@@ -53,6 +53,10 @@ __all__ = [
 ]
 
 
+FEW = 1024
+"""Elements of which all rows are compared at once."""
+
+
 @either
 def inverse(P: Floats) -> Floats:
     """P^-1 (n, n, B) of symmetric positive definite P."""
@@ -260,6 +264,10 @@ def is_positive_definite(P: Floats, tolerance: float = 1e-14) -> Bools:
     """
     with np.errstate(all="ignore"):
         d = _pivots(P)
+        if d[0].size < FEW:
+            diagonal = range(len(d))
+            fine = (d > tolerance * P[diagonal, diagonal]) & (d > 0.0) & np.isfinite(d)
+            return np.asarray(fine.all(axis=0))
         good: Bools = np.ones(P.shape[2:], dtype=np.bool_)
         for k in range(len(d)):
             good &= d[k] > tolerance * P[k, k]

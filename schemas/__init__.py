@@ -13,6 +13,7 @@ from schemas.keys import (
     check_source,
     global_key,
     local_key,
+    order_key,
     parse_key,
     truth_key,
 )
@@ -103,6 +104,7 @@ __all__ = [
     "global_key",
     "local_key",
     "merged",
+    "order_key",
     "pack_lower",
     "parse_key",
     "tracks_at",

@@ -32,10 +32,13 @@ _SLOTS = {kind: [(field.name, getattr(kind, field.name).__set__) for field in fi
 """The attributes of each message, set one by one in `decode`: half the time of a frozen dataclass's own `__init__`."""
 
 
-def encode(message: Message) -> bytes:
+def encode(message: Message, *, sound: bool = False) -> bytes:
     """The MessagePack bytes of a message. `MessageError` if its parts do not fit together, a number does not
-    fit its column, or a covariance is not symmetric."""
+    fit its column, or a covariance is not symmetric. sound: its parts were made to fit together, so that this is
+    checked of a large message only, which may be larger than any reader takes."""
     data = _pack(message)
+    if sound and len(data) < MAX_ITEMS:
+        return data
     for name in ("covariances", "position_covariance", "reference_covariances"):
         matrices = getattr(message, name, None)
         if matrices is not None:

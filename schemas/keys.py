@@ -2,6 +2,7 @@
 
 {realm}/v1/local/{source}/tracks|intensity|info|alive
 {realm}/v1/global/{centre}/tracks|log|status|alive|picture|orders
+{realm}/v1/global/{centre}/orders/{operator}
 {realm}/v1/truth/{scenario}
 """
 
@@ -19,6 +20,7 @@ __all__ = [
     "check_source",
     "global_key",
     "local_key",
+    "order_key",
     "parse_key",
     "truth_key",
 ]
@@ -89,6 +91,12 @@ def global_key(centre: str, what: str, realm: str = REALM) -> str:
     if what not in GLOBAL:
         raise ValueError(f"no global key {what!r} (known: {' '.join(GLOBAL)})")
     return f"{check_realm(realm)}/{VERSION}/global/{centre if centre == '*' else check_name(centre)}/{what}"
+
+
+def order_key(centre: str, operator: str, realm: str = REALM) -> str:
+    """Key on which an operator gives orders: with certificates nobody else can. `*` stands for any operator. Raises
+    ValueError for what is no name or realm."""
+    return f"{global_key(centre, 'orders', realm)}/{operator if operator == '*' else check_name(operator)}"
 
 
 def truth_key(scenario: str, realm: str = REALM) -> str:

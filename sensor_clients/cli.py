@@ -29,6 +29,7 @@ EXAMPLES = """examples:
   sensor-client simulate three-radars --sensor radar2 --fault clock=0.5,x=200,heading=0.3
   sensor-client simulate three-radars --sensor truth --speed 10 --start-at 1767225600
   sensor-client playback autoferry:2 --sensor lidar --data /data/autoferry --connect tcp/192.0.2.1:7447
+  sensor-client simulate three-radars --sensor radar1 --security keys/source-radar1
   sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
   sensor-client playback radar-v2x --sensor radar --data /data
   sensor-client playback mrclam:6 --sensor robot1 --data /data
@@ -85,6 +86,9 @@ def _parser() -> argparse.ArgumentParser:
             type=argument(check_endpoint),
             default=DEFAULT_ENDPOINT,
             help=f"the hub (default {DEFAULT_ENDPOINT})",
+        )
+        command.add_argument(
+            "--security", type=Path, metavar="FILE", help="certificates of this sensor (see `fusion-service keys`)"
         )
         command.add_argument(
             "--fault",
@@ -194,6 +198,7 @@ def _publish(
         end = scenario.start + round(arguments.duration * 1e9)
         events = itertools.takewhile(lambda event: event.time <= end, events)
     where = {"connect": arguments.connect, "realm": arguments.realm, "origin": scenario.origin}
+    where["security"] = arguments.security
     if kind is TrackPublisher:
         where["lineage"] = lineage
     with stop_on_signals() as stop:

@@ -9,12 +9,14 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
+from pathlib import Path
 from typing import Any, Self, SupportsIndex, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from fusion_service.bus import DEFAULT_ENDPOINT, Bus, BusError, Publisher, open_bus
+from fusion_service.bus.security import check_party, maybe_security
 from schemas import (
     ORIGINS,
     REALM,
@@ -56,6 +58,8 @@ M = TypeVar("M", LocalTracks, LocalIntensity, SensorInfo, Truth)
 class _MessagePublisher:
     """One source's session: opens it, fills in the header, numbers the messages of each type."""
 
+    _roles: tuple[str, ...] = ("source", "gateway")
+
     def __init__(
         self,
         source: str,
@@ -67,6 +71,7 @@ class _MessagePublisher:
         wait: bool | float = True,
         stop: threading.Event | None = None,
         clock: Callable[[], int] = time.time_ns,
+        security: str | Path | None = None,
     ) -> None:
         if origin not in ORIGINS:
             raise ValueError(f"bad origin {origin!r}: one of {' '.join(ORIGINS)}")
@@ -79,6 +84,9 @@ class _MessagePublisher:
         self._wait = wait
         self._stop = stop
         self._clock = clock
+        self._security = maybe_security(security)
+        if self._security is not None:
+            check_party(self._security, self._roles, self.source)
         self._lock = threading.Lock()
         self._bus: Bus | None = None
         self._channels: dict[str, tuple[Publisher, int]] = {}
@@ -86,7 +94,8 @@ class _MessagePublisher:
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
-            bus = stack.enter_context(open_bus(self._connect, wait=self._wait, stop=self._stop))
+            opening = open_bus(self._connect, wait=self._wait, stop=self._stop, security=self._security)
+            bus = stack.enter_context(opening)
             self._opened(bus)
             self._bus, self.epoch = bus, self._clock()
             self._stack = stack.pop_all()
@@ -147,14 +156,15 @@ class TrackPublisher(_MessagePublisher):
     source: its name in the key. connect: endpoint or endpoints of the hub. realm: first part of every key.
     origin: live, exercise, simulated or replay. lineage: the sources whose data the tracks contain, if not
     only this one's. wait: for the hub for ever (True), so many seconds, or one try (False); `stop` ends the
-    waiting. clock: now, in ns UTC.
+    waiting. clock: now, in ns UTC. security: the source's file, or folder, of `fusion-service keys`.
 
     `{realm}/v1/local/{source}/alive` stands while it is open. Each opening is a new epoch, in which the
     messages of each type are numbered from 0. If the hub goes away, what is published meanwhile is lost but
     for the last eight messages of each type (the last info), which go out when it is back.
 
-    Raises `ValueError` for a bad name, `BusError` if it cannot connect or is not open, and
-    `schemas.MessageError` (with `reason`), before anything is sent, for what the centre would refuse.
+    Raises `ValueError` for a bad name, `SecurityError` for certificates that are no good, or another's, `BusError` if
+    it cannot connect or is not open, and `schemas.MessageError` (with `reason`), before anything is sent, for what the
+    centre would refuse.
     """
 
     def _opened(self, bus: Bus) -> None:
@@ -284,7 +294,9 @@ class TrackPublisher(_MessagePublisher):
 
 class TruthPublisher(_MessagePublisher):
     """Publishes what is true in a scenario, for the record and for scores. Arguments as in `TrackPublisher`;
-    the scenario's name stands for the source's."""
+    the scenario's name stands for the source's, and the certificate is that of a scenario."""
+
+    _roles = ("scenario",)
 
     def truth(
         self,

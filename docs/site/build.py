@@ -24,6 +24,7 @@ ELSEWHERE = {
     "docker/README.md": "docker.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
+    "SECURITY.md": "threats.md",
 }
 """Pages that are not below docs/: path in the repository, name in the site."""
 SECTIONS = {
@@ -31,6 +32,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "security",
             "arrival",
             "judgement",
             "supervision",
@@ -43,7 +45,7 @@ SECTIONS = {
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "performance", "rules-speed"],
     "API": ["api/*"],
-    "Carry it on": ["architecture", "decisions/README", "contributing", "changelog"],
+    "Carry it on": ["architecture", "threats", "decisions/README", "contributing", "changelog"],
 }
 API = {
     "schemas": "It needs NumPy and MessagePack only.",

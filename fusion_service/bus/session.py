@@ -12,20 +12,23 @@ up every other subscription of its session. `Inbox.put` is what they should call
 
 from __future__ import annotations
 
-import json
+import functools
 import logging
-import re
+import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from typing import Any, Literal
 
 import zenoh
 from zenoh import ext
 
+from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
+from fusion_service.bus.errors import BusError, BusStopped
 from fusion_service.bus.inbox import Inbox
-from fusion_service.errors import FusionError, Stopped
+from fusion_service.bus.joining import join, reason, session_config
+from fusion_service.bus.security import Security, secured
 from schemas import MAX_BYTES
 
 __all__ = [
@@ -37,27 +40,14 @@ __all__ = [
     "Inbox",
     "Publisher",
     "open_bus",
+    "tell_refusals",
 ]
 
-DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 HEARTBEAT = 0.5
 """Seconds after which a lost last sample is noticed."""
-HANDSHAKE = 3.0
-"""Seconds that a hub has for the opening of a session; as long may a process that gave up waiting take to end."""
-RETRY = 0.2
-FIRST, REMIND = 2.0, 30.0
-"""Seconds until it is told that the hub is waited for, and between that and the next time."""
 MAX_PUBLISHERS = 4096
 
 log = logging.getLogger(__name__)
-
-
-class BusError(FusionError):
-    """What the user can mend about the bus, in one line."""
-
-
-class BusStopped(Stopped, BusError):
-    """`stop` was set while waiting for the hub."""
 
 
 class _Guard:
@@ -119,14 +109,15 @@ class Publisher(Declaration):
         except IndexError:
             raise BusError("this publisher is closed") from None
         except zenoh.ZError as error:
-            raise BusError(f"cannot publish: {_reason(error)}") from None
+            raise BusError(f"cannot publish: {reason(error)}") from None
 
 
 class Bus:
     """An open session, made by `open_bus`. Every method may be called from any thread."""
 
-    def __init__(self, session: Any) -> None:
+    def __init__(self, session: Any, rights: Mapping[str, Sequence[str]] | None = None) -> None:
         self._session = session
+        self._rights = rights
         self._declared: dict[Declaration, None] = {}
 
     @property
@@ -135,9 +126,18 @@ class Bus:
         info = self._session.info
         return bool(info.routers_zid() or info.peers_zid())
 
+    def _may(self, act: str, key: str) -> AbstractContextManager[None]:
+        """Raises `BusError` for what the hub would drop without a word; then as `_readable`."""
+        given = None if self._rights is None else self._rights.get(act, ())
+        with _readable(key):
+            if given is not None and not any(zenoh.KeyExpr(one).includes(zenoh.KeyExpr(key)) for one in given):
+                who = ", ".join(self._rights.get("who", ())) if self._rights else ""
+                raise BusError(f"{key}: {who} may not {act} there, only on: {', '.join(given) or 'nothing'}")
+        return _readable(key)
+
     def publisher(self, key: str, cache: int = 1) -> Publisher:
         """A publisher on `key` that keeps its last `cache` samples for late joiners and for who missed some."""
-        with _readable(key):
+        with self._may("publish", key):
             entity = ext.declare_advanced_publisher(
                 self._session,
                 key,
@@ -181,7 +181,7 @@ class Bus:
 
         guard = _Guard(key_expression)
         past = ext.HistoryConfig(detect_late_publishers=True, max_samples=int(history)) if history else None
-        with _readable(key_expression):
+        with self._may("subscribe", key_expression):
             subscriber = ext.declare_advanced_subscriber(
                 self._session,
                 key_expression,
@@ -196,7 +196,7 @@ class Bus:
 
     def announce(self, key: str) -> Declaration:
         """A liveliness token: `watch` elsewhere sees it appear, and go when it is closed or the process dies."""
-        with _readable(key):
+        with self._may("publish", key):
             return Declaration(self, [self._session.liveliness().declare_token(key)])
 
     def watch(self, key_expression: str, callback: Callable[[str, bool], None]) -> Declaration:
@@ -207,31 +207,37 @@ class Bus:
             callback(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
         guard = _Guard(key_expression)
-        with _readable(key_expression):
+        with self._may("subscribe", key_expression):
             entity = self._session.liveliness().declare_subscriber(key_expression, guard.wrap(change), history=True)
         return Declaration(self, [entity], guard)
 
     def answer(self, key: str, handler: Callable[[bytes | None], bytes]) -> Declaration:
         """Answer every `ask` on `key` with `handler(payload)`. If it raises, who asked is told."""
-        guard = _Guard(key)
+        return self.answer_each(key, lambda _, payload: handler(payload))
+
+    def answer_each(self, key_expression: str, handler: Callable[[str, bytes | None], bytes]) -> Declaration:
+        """The same for many keys, with `handler(key, payload)`, the key as it was asked on. Who asked cannot be told
+        from a question, but a hub with a security file lets each party ask on keys of its own only."""
+        guard = _Guard(key_expression)
 
         def reply(query: Any) -> None:
+            asked = str(query.key_expr)
             with query:
                 try:
-                    answer = handler(None if query.payload is None else bytes(query.payload))
+                    answer = handler(asked, None if query.payload is None else bytes(query.payload))
                 except Exception as error:
                     query.reply_err(str(error) or type(error).__name__)
                     raise
-                query.reply(key, answer)
+                query.reply(asked if "*" in key_expression else key_expression, answer)
 
-        with _readable(key):
-            return Declaration(self, [self._session.declare_queryable(key, guard.wrap(reply))], guard)
+        with self._may("publish", key_expression):
+            return Declaration(self, [self._session.declare_queryable(key_expression, guard.wrap(reply))], guard)
 
     def ask(self, key: str, payload: bytes | None = None, timeout: float = 1.0) -> list[tuple[str, bytes]]:
         """Ask everyone who answers on `key` (an expression may reach several): (key, data) of each answer,
         none if nobody is there. Raises `BusError` if all that came are errors or `timeout` seconds have passed.
         Waits: not for use in a callback."""
-        with _readable(key):
+        with self._may("ask", key):
             replies = list(
                 self._session.get(
                     key,
@@ -249,15 +255,35 @@ class Bus:
             log.warning("%s answers: %s", key, error)
         return answers
 
+    def on_link(self, callback: Callable[[str, str, bool], None]) -> Declaration:
+        """Call `callback(common name of its certificate or "", where from, whether it is there)` for every link that
+        there is, comes or goes."""
+
+        def change(event: Any) -> None:
+            link = event.link
+            callback(link.auth_identifier or "", link.dst, event.kind == zenoh.SampleKind.PUT)
+
+        guard = _Guard("links")
+        return Declaration(
+            self, [self._session.info.declare_link_events_listener(guard.wrap(change), history=True)], guard
+        )
+
     def _close(self) -> None:
         try:
             for declaration in reversed(list(self._declared)):
                 try:
                     declaration.close()
                 except zenoh.ZError as error:
-                    log.warning("cannot take back a declaration: %s", _reason(error))
+                    log.warning("cannot take back a declaration: %s", reason(error))
         finally:
             self._session.close()
+
+
+@functools.cache
+def tell_refusals() -> None:
+    """Let Zenoh say on stdout which links it refuses, and why (at most ten lines a second: it waits between them)."""
+    os.environ.setdefault("NO_COLOR", "1")
+    zenoh.init_log_from_env_or("zenoh_link_tls=warn")
 
 
 @contextmanager
@@ -268,107 +294,39 @@ def open_bus(
     *,
     wait: bool | float = True,
     stop: threading.Event | None = None,
+    security: Security | None = None,
 ) -> Iterator[Bus]:
     """A session as a context manager; everything declared on it is taken back and it is closed on every path.
 
     connect, listen: endpoints as "tcp/host:port"; a client connects and a router listens at
     `DEFAULT_ENDPOINT` unless told otherwise. A client waits for its hub: for ever (`wait=True`), so many
     seconds, or for one try (False, 0); signals and `stop` interrupt it at once. It reconnects by itself later on.
-    A router or peer connects in the background. Raises `BusError` in one line if an endpoint is bad, in use or not
-    to be reached in time, `BusStopped` if `stop` was set.
+    A router or peer connects in the background. security: both ends show certificates, by TLS; tcp/ is read as tls/
+    then. Raises `BusError` in one line if an endpoint is bad, in use or not to be reached in time, and why a hub
+    refuses us, `BusStopped` if `stop` was set, `SecurityError` for certificates that nobody would take.
     """
     if mode == "client":
         connect = connect or (DEFAULT_ENDPOINT,)
     elif mode == "router":
         listen = listen or (DEFAULT_ENDPOINT,)
-    config = _config(connect, listen, mode)
+    if security is not None:
+        connect, listen = secured(connect), secured(listen)
+    rights = None
     if mode == "client":
-        session = _join(config, ", ".join(connect), wait, stop)
+        session, rights = join(connect, wait, stop, security)
     else:
+        config = session_config(connect, listen, mode, security)
         try:
             session = zenoh.open(config)
         except zenoh.ZError as error:
             if "in use" in str(error):
                 raise BusError(f"{', '.join(listen)} is in use: is a hub running there already?") from None
-            raise BusError(f"cannot listen on {', '.join(listen)}: {_reason(error)}") from None
-    bus = Bus(session)
+            raise BusError(f"cannot listen on {', '.join(listen)}: {reason(error)}") from None
+    bus = Bus(session, rights)
     try:
         yield bus
     finally:
         bus._close()
-
-
-def _config(connect: Sequence[str], listen: Sequence[str], mode: str) -> zenoh.Config:
-    settings: dict[str, Any] = {
-        "mode": mode,
-        "connect/endpoints": list(connect),
-        "listen/endpoints": list(listen),
-        "connect/retry": {"period_init_ms": 100, "period_max_ms": 1000, "period_increase_factor": 2},
-        "scouting/multicast/enabled": False,
-        "transport/unicast/open_timeout": round(1000 * HANDSHAKE),
-        "timestamping/enabled": True,  # publishers that keep samples need it
-        "transport/shared_memory/enabled": False,
-        "transport/link/rx/max_message_size": 2 * MAX_BYTES,  # what is longer is dropped before it takes memory
-    }
-    if mode == "client":
-        settings["connect/timeout_ms"] = 0  # one attempt per zenoh.open
-    config = zenoh.Config()
-    for key, value in settings.items():
-        try:
-            config.insert_json5(key, json.dumps(value))
-        except zenoh.ZError:
-            raise BusError(f"bad endpoint in {value}: write tcp/host:port, as in {DEFAULT_ENDPOINT}") from None
-    return config
-
-
-def _join(config: zenoh.Config, endpoints: str, wait: bool | float, stop: threading.Event | None) -> Any:
-    """A client's session. `zenoh.open` lets no signal through while it waits for an answer, up to `HANDSHAKE`:
-    it runs on a thread of its own, left to itself if nobody waits any more. Not a daemon thread: one that
-    comes back from Zenoh while the interpreter goes down aborts the process."""
-    lock = threading.Lock()
-    changed = threading.Event()
-    abandoned = threading.Event()
-    sessions: list[Any] = []
-
-    def attempt() -> None:
-        while not abandoned.is_set():
-            try:
-                session: Any = zenoh.open(config)
-            except zenoh.ZError:  # says no more than that it could not
-                if not wait:
-                    break
-                abandoned.wait(RETRY)
-                continue
-            with lock:
-                if not abandoned.is_set():
-                    sessions.append(session)
-                    break
-            session.close()
-        changed.set()
-
-    begin = time.monotonic()
-    deadline = None if wait is True or not wait else begin + wait
-    remind = begin + FIRST
-    threading.Thread(target=attempt, name="bus-join").start()
-    try:
-        while not changed.wait(0.05):
-            now = time.monotonic()
-            if stop is not None and stop.is_set():
-                raise BusStopped(f"stopped while waiting for the hub at {endpoints}")
-            if deadline is not None and now >= deadline:
-                break
-            if now >= remind:
-                log.warning("waiting for the hub at %s (`fusion-service hub` starts one)", endpoints)
-                remind = now + REMIND
-        with lock:
-            if sessions:
-                return sessions.pop()
-        raise BusError(f"no hub answers at {endpoints}: start one with `fusion-service hub`")
-    finally:
-        with lock:
-            abandoned.set()
-        for session in sessions:
-            session.close()
 
 
 @contextmanager
@@ -376,9 +334,4 @@ def _readable(key: str) -> Iterator[None]:
     try:
         yield
     except zenoh.ZError as error:
-        raise BusError(f"{key}: {_reason(error)}") from None
-
-
-def _reason(error: Exception) -> str:
-    """A Zenoh error without the places in its source, on one line."""
-    return " ".join(re.sub(r"\s*at \S+\.rs:\d+\.?", "", str(error)).split())
+        raise BusError(f"{key}: {reason(error)}") from None

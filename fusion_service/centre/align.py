@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import groupby
 from typing import Any
 
@@ -32,6 +34,8 @@ from schemas import Entry, Frame, Motion
 
 __all__ = ["predict_tracks", "usable_rows", "write_back"]
 
+KEPT = 4096
+"""Rows up to which columns that say something of sources are kept."""
 PARTS = ("log_weight", "part_mean", "part_covariance")
 
 
@@ -53,8 +57,10 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
     used, counts, tracks = _sound_tracks(intake, _used(intake, time), time, journal)
     n = len(config.space)
 
-    def each(values: list[Any], kind: type[np.generic]) -> NDArray[Any]:
-        return np.repeat(np.array(values, dtype=kind), counts)
+    many = tuple(counts.tolist())
+
+    def each(values: list[Any], kind: Any) -> NDArray[Any]:
+        return _repeated(tuple(values), kind, many) if len(tracks.id) <= KEPT else _spread(values, kind, many)
 
     whose = each([one.number for one in used], np.intp)
     gates = [chi2_by_size(config.gate if one.said.gate is None else one.said.gate, n) for one in used]
@@ -74,6 +80,19 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         out=each([one.treatment.out for one in used], np.bool_),
         union=each([one.treatment.union for one in used], np.bool_),
     )
+
+
+def _spread(values: Sequence[Any], kind: Any, counts: tuple[int, ...]) -> NDArray[Any]:
+    """A value for each row of each source."""
+    return np.repeat(np.array(values, dtype=kind), counts)
+
+
+@lru_cache(maxsize=256)
+def _repeated(values: tuple[Any, ...], kind: Any, counts: tuple[int, ...]) -> NDArray[Any]:
+    """The same, which is the same from step to step as long as sources bring the same number of tracks."""
+    column = _spread(values, kind, counts)
+    column.flags.writeable = False
+    return column
 
 
 def _used(intake: Intake, time: int) -> list[_Used]:

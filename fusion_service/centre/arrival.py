@@ -22,14 +22,17 @@ class ArrivalClock:
 
     A scan that is not after the newest step makes a step `TICK` after that; one that is too old for the centre to take
     makes none. By the wall clock a scan that is ahead of now waits until now has come there, and where nothing comes,
-    steps are made at multiples of `period`, `delay` behind now. By the messages' own time, `MessageClock` judges which
-    of them are followed; where nothing comes there is no step.
+    steps are made at multiples of `period`, `delay` behind now; half a period later where a step was made in the period
+    before it, and none where one has been made by then: scans that come all the time need no other steps, and none of
+    them has to wait for one. By the messages' own time, `MessageClock` judges which of them are followed; where nothing
+    comes there is no step.
     """
 
     def __init__(self, config: CentreConfig, authenticated: bool = False) -> None:
         self._config = config
         self._spacing = round(config.arrival_spacing * 1e9)
         self._lateness = round(config.lateness * 1e9)
+        self._period = round(config.period * 1e9)
         self._back = round((config.delay + config.period) * 1e9)
         self._margin = margin(config)
         self._messages = MessageClock(config, authenticated) if config.clock == "message" else None
@@ -37,6 +40,8 @@ class ArrivalClock:
         self._waiting: list[int] = []
         self._free = -1
         """When the next step may be made, ns."""
+        self._held, self._until = -1, -1
+        """Time of a step that is made where nothing comes, and until when it waits for that, ns."""
 
     @property
     def skipped(self) -> int:
@@ -58,25 +63,34 @@ class ArrivalClock:
     def due(self, now: int, last: int) -> int | None:
         """Time of the step to make now, ns, or None; last: that of the newest step, -1 for none. It is before `last`
         where a clock was set back: the centre judges by `ClockSet` whether a new era begins."""
-        grid = None
-        if self._messages is None:
-            grid = self._grid.due(now)
-            if grid is not None and grid < last - self._back:
-                return grid
-        else:
+        if self._messages is not None:
             self._follow()
+        elif (grid := self._grid.due(now)) is not None:
+            if grid < last - self._back:
+                self._held = -1
+                return grid
+            self._held, self._until = grid, now + (self._period // 2 if last > grid - self._period else 0)
         if not self._free - self._spacing <= now < self._free:
             newest = self._newest(now if self._messages is None else self._messages.limit())
             if newest is not None and (at := self._step_for(newest, last)) is not None:
                 self._free = now + self._spacing
                 return at
-        return grid if grid is not None and grid > last else None
+        return self._without_data(now, last)
+
+    def _without_data(self, now: int, last: int) -> int | None:
+        """The step that is made where nothing comes, if it is due."""
+        held = self._held
+        if held >= 0 and (held <= last or now >= self._until):
+            self._held = -1
+        return held if held > last and now >= self._until else None
 
     def wait(self, now: int) -> float:
         """Seconds until a step may be due without anything new; infinite where none will be."""
         waits = self._waiting and (self._messages is None or self._waiting[0] <= self._messages.limit())
         at = max(self._waiting[0], self._free) if waits else None
         until = float("inf") if at is None else max(0.0, (at - now) / 1e9)
+        if self._held >= 0:
+            until = min(until, max(0.0, (self._until - now) / 1e9))
         return until if self._messages is not None else min(until, self._grid.wait(now))
 
     def _follow(self) -> None:

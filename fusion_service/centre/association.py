@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints
+from fusion_service.arrays import Floats, Ints, marked
 from fusion_service.densities import Mixtures, log_sum
 
 __all__ = [
@@ -59,7 +59,7 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
         return
     order = np.argsort(labels, kind="stable")
     ranked = labels[order]
-    new = np.flatnonzero(ranked[1:] != ranked[:-1])
+    new = marked(ranked[1:] != ranked[:-1])
     edges = np.zeros(len(new) + 2, dtype=np.intp)
     edges[1:-1], edges[-1] = new + 1, len(labels)
     starts, counts = edges[:-1], edges[1:] - edges[:-1]
@@ -67,7 +67,7 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
     if (counts == size).all():
         yield unique, order.reshape(len(unique), size)
         return
-    for k in np.flatnonzero(np.bincount(counts)).tolist():
+    for k in marked(np.bincount(counts)).tolist():
         chosen = counts == k
         yield unique[chosen], order[starts[chosen][:, None] + np.arange(k)]
 
@@ -91,7 +91,7 @@ def uniform_ci(means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
     covariance, _, margin = linalg.sweep(information)
     x, C = linalg.matvec(covariance, vector), covariance * float(len(means))
     sound = (np.minimum(least, margin) > least_sound) & np.isfinite(x).all(axis=0) & np.isfinite(C).all(axis=(0, 1))
-    bad = np.flatnonzero(~sound)
+    bad = marked(~sound)
     if len(bad) and means.dtype == np.float64:
         x[:, bad], C[:, :, bad] = uniform_ci(
             means[:, :, bad].astype(np.longdouble), covariances[:, :, :, bad].astype(np.longdouble)
@@ -178,7 +178,7 @@ def within(positions: Floats, sigma: Floats, reach: float, source: Ints, one: In
 def near_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints) -> tuple[Ints, Ints, bool]:
     """`candidate_pairs`, and whether any row is crowded."""
     count = len(sigma)
-    fit = np.flatnonzero(np.isfinite(positions).all(axis=0) & np.isfinite(sigma))
+    fit = marked(np.isfinite(positions).all(axis=0) & np.isfinite(sigma))
     sigma = np.maximum(sigma, 1e-9)
     names, rank = [], np.zeros(count)
     for labels, rows in by_size(source[fit]):
@@ -201,7 +201,7 @@ def near_pairs(positions: Floats, sigma: Floats, reach: float, source: Ints) -> 
             found = np.zeros(len(rows), dtype=np.intp)
             for (size_b, rows_b), tree in zip(groups[a:], trees[a:], strict=True):
                 bound = 1.001 * reach * (size_a + size_b) + 0.001 * size_a
-                seek = np.flatnonzero(found < TIERS[-1])
+                seek = marked(found < TIERS[-1])
                 for k in TIERS:
                     one, two, number = _nearest(tree, points[rows[seek]], k, bound)
                     full = number == k

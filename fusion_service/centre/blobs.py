@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Ints, from_bytes, to_bytes
+from fusion_service.arrays import Bools, Ints, from_bytes, marked, to_bytes
 from fusion_service.centre.extents import BLOB, shaped, widened
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
@@ -117,7 +117,7 @@ class Shared:
             return missed
         missed = missed.copy()
         missed[self.track[self._rows.source[self.row] == source]] = False
-        track = np.flatnonzero(missed)
+        track = marked(missed)
         which, row = self.covered(np.full(len(track), source), track)
         missed[track[which[self.told_apart(row, track[which])]]] = False
         return missed
@@ -162,7 +162,7 @@ class Shared:
     def _neighbours(self) -> Ints:
         """(G, `NEIGHBOURS`): places of the nearest other tracks, the nearest first, -1 where there are no more."""
         near = np.full((len(self._now.id), NEIGHBOURS + 1), -1, dtype=np.intp)
-        known = np.flatnonzero(self._now.time >= 0)
+        known = marked(self._now.time >= 0)
         if len(known):
             point = np.nan_to_num(self._now.mean[self._places][:, known].T)
             _, index = cKDTree(point).query(point, k=NEIGHBOURS + 1)
@@ -248,7 +248,7 @@ class Blobs:
         good = (young | apart)[which]
         shared.row, shared.track = row[good], at[which[good]]
         self.unmerged = shared.pairs()
-        kept = np.flatnonzero(young | apart)
+        kept = marked(young | apart)
         self._lost = lost.take(kept[np.argsort(-lost.time[kept], kind="stable")][:MOST])
 
     def _alive(self, lost: _Links) -> Bools:
@@ -302,7 +302,7 @@ def _vanished(
     for _ in range(CHAIN):
         goes_on, at = _found(mine, went, source, local)
         had, whose = _found(mine[goes_on], track[at[goes_on]], mine, was.track)
-        some = np.flatnonzero(goes_on)[had]
+        some = marked(goes_on)[had]
         went = went.copy()
         went[some] = was.local[whose[had]]
     return was._replace(local=went)

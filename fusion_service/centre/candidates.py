@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints, among, picked
+from fusion_service.arrays import Floats, Ints, among, marked, picked
 from fusion_service.centre.association import overlap
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import Judgement
@@ -82,8 +82,8 @@ def find_candidates(
     if len(agreed.labels) < len(now.id):
         mean, covariance, at = now.mean.copy(), now.covariance.copy(), now.find(agreed.labels)
         mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
-    loose = np.flatnonzero(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
-    known = np.flatnonzero(now.time >= 0)
+    loose = marked(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
+    known = marked(now.time >= 0)
     means, covariances = (mean, covariance) if len(known) == len(now.id) else (mean[:, known], covariance[..., known])
     if len(loose):
         means = np.concatenate([means, picked(tracks.mean, loose)], axis=1)
@@ -96,6 +96,9 @@ def find_candidates(
     sigma = np.sqrt(sum(covariances[place, place] for place in places))
     reach = float(np.sqrt(gates.max(initial=tests.gate[-1])))
     i, j = beside.pairs(now.id[known], means[places], sigma, reach, source)
+    if not len(i):
+        own = np.full(len(tracks.id), np.nan)
+        return Candidates(NO_PAIRS, NO_PAIRS, NO_PAIRS, NO_PAIRS, own, loose, mean, covariance)
     same = compartment[i] == compartment[j]
     i, j = i[same], j[same]
     first_row, second_row = i >= len(known), j >= len(known)
@@ -123,7 +126,7 @@ def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candi
     """Those of them that orders and identities allow, and what these say of one target against two counted as the
     states are: minus twice the log-likelihood ratio in what a pair costs."""
     own, joins, rivals = near.own, near.joins, near.rivals
-    mine = np.flatnonzero(np.isfinite(own))
+    mine = marked(np.isfinite(own))
     if len(mine):
         own = own.copy()
         own[mine] -= 2.0 * meeting.with_tracks(mine, now.find(rows.tracks.link[mine])).ratio
@@ -171,7 +174,7 @@ class _Without:
         if len(keys):
             key = self._rows.source[row] * self._width + track
             at = np.minimum(np.searchsorted(keys, key), len(keys) - 1)
-            mine = np.flatnonzero(keys[at] == key)
+            mine = marked(keys[at] == key)
             place = order[at[mine]]
             agreed = self._judged.agreed
             others = agreed.size[place] > 1
@@ -207,7 +210,7 @@ class _Without:
             mine, its = mixtures
             several = np.isfinite(mine.log_weights).sum(axis=0)[row] > 1
             several |= np.isfinite(its.log_weights).sum(axis=0)[track] > 1
-            at = np.flatnonzero(several)
+            at = marked(several)
             distance[at], spread[at] = _overlap(mine.take(row[at]), its.take(track[at]), self._unknown)
         gate = self._rows.gate[size, row]
         return Pairs(row, track, distance, spread, size, gate).take(distance <= gate)
@@ -231,7 +234,7 @@ def _gated(
         distance[part], spread[part], size[part] = apart(both, offset, unknown)
     if parts is not None:
         several = np.isfinite(parts.log_weights).sum(axis=0) > 1
-        at = np.flatnonzero(several[i] | several[j])
+        at = marked(several[i] | several[j])
         distance[at], spread[at] = _overlap(parts.take(i[at]), parts.take(j[at]), unknown)
     gate = np.maximum(gates[size, i], gates[size, j])
     return Pairs(i, j, distance, spread, size, gate).take(distance <= gate)
@@ -246,7 +249,7 @@ def _near_own(rows: Rows, now: Picture, inside: Ints, near: Pairs, known: Ints) 
     one, other = np.concatenate([a, b]), np.concatenate([b, a])
     distance = np.concatenate([near.distance, near.distance])
     order = np.lexsort((other, distance, one))
-    begins = np.flatnonzero(np.diff(one[order], prepend=-1))
+    begins = marked(np.diff(one[order], prepend=-1))
     rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
     order = np.sort(order[rank < MOST_RIVALS])
     order = order[np.lexsort((other[order], one[order]))]

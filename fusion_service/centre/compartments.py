@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among, find_sorted
+from fusion_service.arrays import among, find_sorted, marked
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import Source
@@ -55,7 +55,11 @@ class Compartments:
         """After a step: ids (G,) sorted, of its picture; rows with the links of the step."""
         origin, apart = self._now(ids, rows, names)
         still = self._quarantined()
-        self.track, self.origin, self.apart = ids, origin, np.where(among(apart, still), apart, NONE).astype(np.int32)
+        if len(still):
+            apart = np.where(among(apart, still), apart, NONE).astype(np.int32)
+        else:
+            apart = np.full(len(ids), NONE, dtype=np.int32)
+        self.track, self.origin, self.apart = ids, origin, apart
         if not len(still) and len(self._names.texts) > len(ORIGINS):
             self._names = Words()
 
@@ -68,6 +72,8 @@ class Compartments:
 
     def _rows_apart(self, rows: Rows, names: tuple[str, ...]) -> Codes:
         quarantined = self._intake.orders.about("quarantine")
+        if not quarantined:
+            return np.full(len(rows.source), NONE, dtype=np.int32)
         codes = self._names.codes([name if name in quarantined else None for name in names])
         return codes[rows.source] if len(codes) else np.zeros(0, dtype=np.int32)
 
@@ -82,7 +88,7 @@ class Compartments:
             origin[known], apart[known] = self.origin[at[known]], self.apart[at[known]]
         link = rows.tracks.link
         at = np.minimum(find_sorted(ids, link), len(ids) - 1)
-        linked = np.flatnonzero((link != NO_TRACK) & (ids[at] == link))
+        linked = marked((link != NO_TRACK) & (ids[at] == link))
         at = at[linked]
         origin[at], apart[at] = 0, np.iinfo(np.int32).max
         np.maximum.at(origin, at, rows.tracks.origin[linked])

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints, picked
+from fusion_service.arrays import Floats, Ints, marked, picked
 from fusion_service.centre.association import SOUND as SOUND_ALONE
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.compiled.either import FAST
@@ -84,7 +84,7 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
 
 def _partners(partner: Ints, means: Floats, covariances: Floats) -> tuple[Floats, Floats]:
     """Means and covariances of the rows `partner` (M,), NaN for -1."""
-    alone = np.flatnonzero(partner < 0)
+    alone = marked(partner < 0)
     if len(alone) == len(partner):
         return np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)
     mean, covariance = means.take(partner, axis=-1), covariances.take(partner, axis=-1)
@@ -99,7 +99,7 @@ def _compiled(
     of each row are written into the last two."""
     k = rows.shape[1]
     x, P, margin, beside = FAST["intersect"](means, covariances, rows, (others_mean, others_covariance))
-    bad = np.flatnonzero(~(margin > (SOUND_ALONE if k == 2 else SOUND)))
+    bad = marked(~(margin > (SOUND_ALONE if k == 2 else SOUND)))
     if len(bad):
         x[:, bad], P[:, :, bad] = _of_groups(rows[bad], means, covariances)
     for j in range(k if k > 2 else 0):
@@ -158,7 +158,7 @@ def _inverted(
     out = []
     for j in range(k + 1):
         part = slice(j * count, (j + 1) * count)
-        one, P, bad = x[:, part], inverse[..., part], np.flatnonzero(~sound[part])
+        one, P, bad = x[:, part], inverse[..., part], marked(~sound[part])
         if len(bad):
             chosen = [i for i in range(k) if i != j]
             one[:, bad], P[:, :, bad] = uniform_ci(

@@ -23,7 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, marked
 from fusion_service.centre.candidates import Candidates
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import manoeuvred
@@ -97,7 +97,7 @@ class Copies:
             if key in new or misses >= FEW or (not standing and len(self.held) + len(new) >= MOST):
                 continue
             new[key] = Copy(track, texts[k], misses, *_told(offset[:, k], velocity[:, k]))
-        kept = {meeting.key_of(int(free[n])): n for n in np.flatnonzero(rows.tracks.identity[free] != NONE).tolist()}
+        kept = {meeting.key_of(int(free[n])): n for n in marked(rows.tracks.identity[free] != NONE).tolist()}
         for key in new:
             held[kept[key]] = True
         self._follow(rows, now, meeting, new, set(kept), journal)
@@ -109,7 +109,7 @@ class Copies:
     ) -> None:  # fmt: skip
         """Tell what begins and what is over. asked: the rows that were free in this step; of the others those stay
         that are there, without a link, and their track is."""
-        say = np.flatnonzero((rows.tracks.link == NO_TRACK) & (rows.tracks.identity != NONE))
+        say = marked((rows.tracks.link == NO_TRACK) & (rows.tracks.identity != NONE))
         loose = {meeting.key_of(one) for one in say.tolist()} if self.held else set()
         there = set(now.id.tolist()) if self.held else set()
         quiet = {
@@ -164,7 +164,7 @@ class Copies:
         fits = (distance <= self._tests.gate[size]) & (now.time[first] >= 0) & (now.time[second] >= 0)
         pairs: dict[tuple[int, int], tuple[int, int]] = {}
         gone: dict[int, int] = {}
-        for k in np.flatnonzero(fits).tolist():
+        for k in marked(fits).tolist():
             mine, its = fed.get(int(first[k]), set()), fed.get(int(second[k]), set())
             if not mine or not its or mine & its:
                 continue
@@ -176,7 +176,7 @@ class Copies:
             if seen > FEW and not (gone.keys() | set(gone.values())) & set(key):
                 gone[key[1]] = key[0]
                 journal.merge(key[0], key[1], float(distance[k]))
-                moved = np.flatnonzero(rows.tracks.link == np.uint64(key[1]))
+                moved = marked(rows.tracks.link == np.uint64(key[1]))
                 journal.broke(rows, moved, rows.tracks.link[moved], np.full(len(moved), np.nan))
                 set_links(rows.tracks, moved, NO_TRACK, step)
         self.pairs = {key: one for key, one in pairs.items() if not gone.keys() & set(key)}

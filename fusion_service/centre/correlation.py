@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints, picked
+from fusion_service.arrays import Bools, Floats, Ints, marked, picked
 from fusion_service.centre.derived import MOST_MEMBERS, Followed
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.kept_weights import KeptWeights
@@ -168,7 +168,7 @@ def _part(
 ) -> Fused:
     """The fusions of some elements, in a batch in which the others are NaN."""
     N, n, size = means.shape
-    at = np.flatnonzero(some)
+    at = marked(some)
     if len(at) == size:
         return fuse_last(rule, means, covariances, influence=True, start=start, **options)
     whole = Fused(*(np.full((*shape, size), np.nan) for shape in ((n,), (n, n), (N,), (N,))))

@@ -139,6 +139,8 @@ def _opinions(
 ) -> Floats:
     """The opinion of all sources that report existence, made anew where one has new data."""
     opinion = opinion.copy()
+    if not len(saying):
+        return opinion
     new = np.zeros(len(picture.id), dtype=np.bool_)
     new[picture.find(rows.tracks.link[saying[rows.fresh[saying]]])] = True
     for ids, members in by_size(rows.tracks.link[saying]):

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
@@ -56,7 +56,7 @@ def fuse_all(
     influence = np.where(tracks.link != NO_TRACK, 0.0, np.nan)
     linked = linked if left is None else linked & ~left
     used = linked & (tracks.time > tracks.used) if config.memory == "recursive" else linked
-    chosen = np.flatnonzero(used)
+    chosen = marked(used)
     lineage, way = picture.lineage.copy(), picture.way.copy()
     state_time = np.where(picture.time >= 0, time, -1)
     mixed: list[tuple[Ints, Mixtures]] = []
@@ -73,7 +73,7 @@ def fuse_all(
         if config.memory == "recursive":
             old, echo = picture.time[at] >= 0, rows.echo[members].any(axis=1)
             for some, bound in ((old & ~echo, config.memory_correlation), (old & echo, 1.0)):
-                _remember(one, spread, gains, picture, at, np.flatnonzero(some), bound, unknown)
+                _remember(one, spread, gains, picture, at, marked(some), bound, unknown)
         state_time[at], way[at] = time, by
         states.append((one, spread))
         lineage[at] = kinship.inherited(rows, members, lineage[at], memory=config.memory == "recursive")
@@ -203,7 +203,7 @@ def _as_mixtures(
     with np.errstate(invalid="ignore"):  # of sources that rule each other out there is no mass left
         mean, covariance = parts.moments()
     sound = linalg.is_positive_definite(covariance) & np.isfinite(mean).all(axis=0)
-    several[np.flatnonzero(several)[~sound]] = False
+    several[marked(several)[~sound]] = False
     return parts.take(sound), several
 
 
@@ -254,7 +254,7 @@ def with_parts(picture: Picture, done: Ints, mixed: list[tuple[Ints, Mixtures]])
         size = len(parts.log_weights)
         log_weight[:size, at] = parts.log_weights
         means[:, :size, at], covariances[:, :, :size, at] = parts.means, parts.covariances
-    needed = int(np.flatnonzero(np.isfinite(log_weight).any(axis=1))[-1]) + 1 if log_weight.shape[1] else 0
+    needed = int(marked(np.isfinite(log_weight).any(axis=1))[-1]) + 1 if log_weight.shape[1] else 0
     if needed <= 1:
         columns = no_parts(len(picture.mean), len(picture.id))
     else:

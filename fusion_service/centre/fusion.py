@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among
+from fusion_service.arrays import among, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
 from fusion_service.centre.blobs import Blobs, Shared
@@ -120,7 +120,7 @@ class FusionCentre(Centre):
         old = np.array(sorted(new), dtype=np.uint64)
         to = np.array([new[track] for track in old.tolist()], dtype=np.uint64)
         for source in self._intake.sources.values():
-            at = np.flatnonzero(among(source.tracks.link, old))
+            at = marked(among(source.tracks.link, old))
             if len(at):
                 link = to[np.searchsorted(old, source.tracks.link[at])]
                 double = among(link, np.delete(source.tracks.link, at))

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, among, picked, subset
+from fusion_service.arrays import Bools, Floats, Ints, among, marked, picked, subset
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -76,7 +76,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     predicted, seen = _from_prediction(rows, linked, now, time, settings)
     jumped = fresh & (predicted > tests.keep[seen])
     outside = np.where(fresh, jumped, tracks.outside[linked])
-    some = np.flatnonzero(~outside if rows.out is None else ~outside & ~rows.out[linked])
+    some = marked(~outside if rows.out is None else ~outside & ~rows.out[linked])
     agreed = consensus(links[some], subset(tracks.mean, linked[some]), subset(tracks.covariance, linked[some]))
     distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
@@ -105,16 +105,16 @@ def _without(agreed: Consensus, rows: Rows, had: Ints, inside: Ints) -> Consensu
     tracks = rows.tracks
     mark = np.zeros(len(rows.source), dtype=np.bool_)
     mark[inside] = True
-    kept = np.flatnonzero(mark[had])
+    kept = marked(mark[had])
     links = tracks.link[inside]
     place = np.searchsorted(agreed.labels, links)
     count = np.bincount(place, minlength=len(agreed.labels))
-    at = np.flatnonzero(count)
+    at = marked(count)
     labels = agreed.labels[at]
     mean, covariance = picked(agreed.mean, at), picked(agreed.covariance, at)
     others_mean, others_covariance = picked(agreed.others_mean, kept), picked(agreed.others_covariance, kept)
     size = agreed.size[kept]
-    fewer = np.flatnonzero(size != count[place])
+    fewer = marked(size != count[place])
     some = inside[fewer]
     anew = consensus(links[fewer], picked(tracks.mean, some), picked(tracks.covariance, some))
     changed = np.searchsorted(labels, anew.labels)
@@ -159,7 +159,7 @@ def _worst(
 ) -> Ints:
     """Of the bad rows of each global track with new data the one to leave out: farthest from the others, then from
     the prediction, then youngest, then last in order."""
-    at = np.flatnonzero(bad)
+    at = marked(bad)
     if not len(at):
         return at
     at = at[among(links[at], links[fresh])]

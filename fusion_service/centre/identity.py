@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints, among
+from fusion_service.arrays import Floats, Ints, among, marked
 from fusion_service.centre.beliefs import OPEN, Beliefs, learned, no_beliefs
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
@@ -64,7 +64,7 @@ class Identities:
         if not (says.any() or len(self.identity.track) or len(self.kind.track) or self.ordered()):
             return
         self.identity, self.kind = (_inherited(one, heirs) for one in (self.identity, self.kind))
-        new = np.flatnonzero(says & (tracks.link != NO_TRACK) & ~tracks.outside & (tracks.updated > tracks.told))
+        new = marked(says & (tracks.link != NO_TRACK) & ~tracks.outside & (tracks.updated > tracks.told))
         new = new[among(tracks.link[new], ids)]
         known = np.concatenate([self.identity.track, self.kind.track])
         new = new[~rows.echo[new] | ~among(tracks.link[new], known)]  # its own word is no news to a centre
@@ -128,7 +128,7 @@ class Identities:
         """Identity (code, -1: none) and its probability (G,) of each of these tracks: of its schemes the surest."""
         code, p = _of_tracks(self.identity, ids, OPEN)
         for track, text in self.ordered().items():
-            at = np.flatnonzero(ids == np.uint64(track))
+            at = marked(ids == np.uint64(track))
             code[at], p[at] = self._intake.said.identity.code(text), 1.0
         return code, p
 
@@ -140,7 +140,7 @@ class Identities:
         """For candidate pairs (row, global id), each (P,)."""
         ratio, forbidden = np.zeros(len(row)), np.zeros(len(row), dtype=np.bool_)
         code = rows.tracks.identity[row]
-        said = np.flatnonzero(code != NONE)
+        said = marked(code != NONE)
         if not len(said) or not len(self.identity.track):
             return Terms(ratio, forbidden)
         schemes, best = self._intake.said.identity.schemes(), self.identity.best(OPEN)
@@ -152,6 +152,11 @@ class Identities:
         other = (best[0][at] != code[said]) & (best[1][at] >= TRUSTED)
         forbidden[said] = other & (trust >= TRUSTED)
         return Terms(ratio, forbidden)
+
+    @property
+    def believes(self) -> bool:
+        """Whether any track is believed to be something."""
+        return len(self.identity.track) > 0
 
     def trusted_rows(self, rows: Rows, some: Ints) -> tuple[Ints, Codes]:
         """Of some rows those that say, from a source that is trusted, what they are, in order, and what (codes)."""
@@ -195,7 +200,7 @@ class Identities:
         tracks = np.unique(link)
         keys = np.searchsorted(tracks, link) * width + question
         order = np.argsort(keys, kind="stable")
-        pairs = np.flatnonzero(among(row, mine) & among(track, tracks))
+        pairs = marked(among(row, mine) & among(track, tracks))
         place = np.searchsorted(mine, row[pairs])
         wanted = np.searchsorted(tracks, track[pairs]) * width + asked[place]
         at = np.minimum(np.searchsorted(keys[order], wanted), len(keys) - 1)
@@ -254,7 +259,7 @@ class Identities:
 def _inherited(beliefs: Beliefs, heirs: Mapping[int, int]) -> Beliefs:
     """With what was known of tracks that go on as others."""
     old = np.array(sorted(heirs), dtype=np.uint64)
-    at = np.flatnonzero(among(beliefs.track, old))
+    at = marked(among(beliefs.track, old))
     if not len(at):
         return beliefs
     new = np.array([heirs[track] for track in old.tolist()], dtype=np.uint64)

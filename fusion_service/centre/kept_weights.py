@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints, among, from_bytes, to_bytes
+from fusion_service.arrays import Floats, Ints, among, from_bytes, marked, to_bytes
 from fusion_service.records import columns_of
 
 __all__ = ["STEPS", "Ids", "KeptWeights"]
@@ -67,9 +67,12 @@ class KeptWeights:
         where there are none at all."""
         if len(sources) < FEWEST or not self._last:
             return None
+        kept = self._last.get(len(sources))
+        if kept is not None and _same(kept.id, ids) and bool((kept.source == sources).all()):
+            return kept.weight.copy()
         out = np.full(sources.shape, np.nan)
         for count in sorted(self._last, key=lambda count: (count != len(sources), -count)):
-            todo = np.flatnonzero(np.isnan(out[0]))
+            todo = marked(np.isnan(out[0]))
             if not len(todo):
                 break
             kept = self._last[count]
@@ -85,7 +88,7 @@ class KeptWeights:
 
     def note(self, ids: Ids, sources: Ints, weights: Floats) -> None:
         """Weights (N, B) that were used in this step."""
-        good = np.flatnonzero(~np.isnan(weights[0]))
+        good = marked(~np.isnan(weights[0]))
         if len(weights) >= FEWEST and len(good):
             new = _Kept(ids[good], sources[:, good].astype(np.int64), weights[:, good], np.zeros(len(good), np.int64))
             self._next.setdefault(len(weights), []).append(new)
@@ -95,6 +98,8 @@ class KeptWeights:
         after = {count: parts[0].join(*parts[1:]) for count, parts in self._next.items()}
         for count, old in self._last.items():
             new = after.get(count)
+            if new is not None and _same(old.id, new.id):
+                continue
             stays = old.age < STEPS if new is None else (old.age < STEPS) & ~among(old.id, new.id)
             if stays.any():
                 kept = old.take(stays)
@@ -117,6 +122,10 @@ class KeptWeights:
                 names, from_bytes(sources, whole).reshape(shape), from_bytes(weights, np.zeros(0)).reshape(shape),
                 from_bytes(age, whole),
             )  # fmt: skip
+
+
+def _same(one: Ids, other: Ids) -> bool:
+    return len(one) == len(other) and bool((one == other).all())
 
 
 def _brought(known: Ints, weights: Floats, sources: Ints) -> Floats:

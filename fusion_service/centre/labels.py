@@ -52,6 +52,9 @@ class Labels:
         heirs: {id that ended: id that goes on for it}."""
         self.identities.follow(rows, picture.id, heirs)
         self.compartments.follow(picture.id, rows, names)
+        if not (self.identities.believes or self.identities.ordered() or self.twice.standing):
+            self.identities.compact()
+            return
         code, p = self.identities.named(picture.id)
         trusted = (code != NONE) & (p >= TRUSTED)
         if trusted.any() or self.twice.standing:

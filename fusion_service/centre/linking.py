@@ -18,7 +18,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, among
+from fusion_service.arrays import Bools, Floats, Ints, among, marked
 from fusion_service.centre.births import group, locals_of
 from fusion_service.centre.candidates import Candidates, find_candidates
 from fusion_service.centre.copies import Copies
@@ -81,6 +81,9 @@ class Linker:
         merged = self._merge(rows, now, near, emptied(rows, before, believed, now, near.tracks), step, journal)
         if not merged:
             merged = self.copies.joined(rows, now, near, meeting, step, time, journal)
+        if not len(near.loose) and not self.copies.held:
+            rows.tracks.seen[joined], rows.tracks.judged[joined] = time, rows.tracks.updated[joined]
+            return picture, merged
         free = near.loose[rows.tracks.link[near.loose] == NO_TRACK]
         free = free[~self.copies.hold(rows, now, near, meeting, free, time, journal)]
         starting = self._shadow(rows, now, near, meeting, free)
@@ -245,7 +248,7 @@ class Linker:
         size = np.bincount(groups, minlength=count)
         may = np.bincount(groups, rows.may_start[free], minlength=count) > 0
         may &= (np.bincount(groups, starting & rows.may_start[free], minlength=count) > 0) | (size > 1)
-        chosen = np.flatnonzero(may)
+        chosen = marked(may)
         room = max(0, self._most - len(picture.id))
         if len(chosen) > room:
             journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(chosen) - room))
@@ -271,6 +274,8 @@ class Linker:
         """Join global tracks that share no source and that the evidence says are one: {newer id: older id}. left: pairs
         of which one was emptied into the other, which are one unless the evidence says that they are two."""
         pairs = near.tracks
+        if not (left or len(pairs.first) or len(self.merges.sums.older)):
+            return {}
         if len(pairs.first):
             masks = _masks(rows, now)
             pairs = pairs.take((masks[pairs.first] & masks[pairs.second]) == 0)
@@ -288,7 +293,7 @@ class Linker:
                 taken |= {old, new}
                 merged[new] = old
                 journal.merge(old, new, far[old, new])
-                moved = np.flatnonzero(rows.tracks.link == np.uint64(new))
+                moved = marked(rows.tracks.link == np.uint64(new))
                 outside = rows.tracks.outside[moved]
                 set_links(rows.tracks, moved, np.uint64(old), step)
                 rows.tracks.outside[moved] = outside
@@ -308,6 +313,8 @@ class Linker:
 
 def _vacant(near: Candidates, meeting: Meeting) -> Candidates:
     """Without the pairs whose place another row has by order."""
+    if not len(meeting.forced_row):
+        return near
     joins, rivals = (pairs.take(~meeting.taken(pairs.first, pairs.second)) for pairs in (near.joins, near.rivals))
     return altered(near, joins=joins, rivals=rivals)
 
@@ -335,7 +342,7 @@ def _held(rows: Rows, now: Picture, row: Ints, track: Ints) -> Bools:
 def _holders(rows: Rows, now: Picture, wanted: Ints, name: int) -> Ints:
     """The rows of the source that stand in a track that another row of it may join or exchange its own for."""
     ids = np.unique(now.id[wanted])
-    mine = np.flatnonzero((rows.source == name) & (rows.tracks.link != NO_TRACK))
+    mine = marked((rows.source == name) & (rows.tracks.link != NO_TRACK))
     return mine[among(rows.tracks.link[mine], ids)]
 
 

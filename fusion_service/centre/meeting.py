@@ -27,6 +27,7 @@ MOST_NAMESAKES = 4
 """Tracks that are trusted to be one and the same thing, which a row that says so is compared with."""
 
 
+NOWHERE: Ints = np.zeros(0, dtype=np.intp)
 NOBODY: Ids = np.zeros((0, 2), dtype=np.uint64)
 
 
@@ -56,6 +57,8 @@ class Meeting:
         """Make at once the links that are ordered, and break those that must not be."""
         tracks = self._rows.tracks
         bad = self._unwanted()
+        if not len(bad) and not len(self.forced_row):
+            return
         journal.broke(self._rows, bad, tracks.link[bad], np.full(len(bad), np.nan))
         set_links(tracks, bad, NO_TRACK, step)
         other = tracks.link[self.forced_row] != self.forced_track
@@ -94,6 +97,8 @@ class Meeting:
 
     def of_tracks(self, a: Ints, b: Ints) -> Mask:
         """Of P pairs of global tracks (places in `ids`), those never to be merged."""
+        if not len(a):
+            return np.zeros(0, dtype=np.bool_)
         forbidden: Mask = self.compartment_of_tracks[a] != self.compartment_of_tracks[b]
         code, p = self._identities.named(self._ids)
         both = (code[a] != NONE) & (code[b] != NONE) & (p[a] >= TRUSTED) & (p[b] >= TRUSTED)
@@ -142,6 +147,8 @@ class Meeting:
     def namesake_tracks(self, most: int) -> tuple[Ints, Ints]:
         """Pairs (K,) of global tracks (places in `ids`) that are trusted to be the same thing, and may be: the oldest
         with each other one; at most so many."""
+        if not self._identities.believes:
+            return NOWHERE, NOWHERE
         track, of = self._known()
         oldest = track[np.searchsorted(of, of, "left")] if len(of) else track
         other = np.flatnonzero(track != oldest)[:most]

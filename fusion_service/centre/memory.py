@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints, among
+from fusion_service.arrays import Bools, Floats, Ints, among, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size
 from fusion_service.centre.correlation import AUTO, declared_correlation, declared_motions, sound_rows
@@ -170,10 +170,10 @@ class Memory:
         good &= ~spoiled[row]
         whole = filtered[at] & (tracks.time > tracks.used) & (spoiled | ~capable | ~settled)
         self._note(rows, names, row, stays, found, good)
-        new = self._as_operations(rows, names, versions, found, np.flatnonzero(good))
+        new = self._as_operations(rows, names, versions, found, marked(good))
         kept = among(self.filters.pending.track, picture.id[filtered[:-1]])
-        operations = self.filters.pending.take(kept).join(new, _whole(rows, np.flatnonzero(whole), time))
-        some = np.flatnonzero(filtered[:-1])
+        operations = self.filters.pending.take(kept).join(new, _whole(rows, marked(whole), time))
+        some = marked(filtered[:-1])
         which = np.searchsorted(picture.id[some], operations.track)
         cut = closed(self._cut(rows, names, at, len(picture.id), time)[some], which, operations.time)
         states, bases, share, beside = run(base.take(some), which, operations, cut, time, self.motions)
@@ -187,7 +187,7 @@ class Memory:
         mean, covariance, when = picture.mean.copy(), picture.covariance.copy(), picture.time.copy()
         mean[:, some], covariance[:, :, some], when[some] = states.mean, states.covariance, time
         lineage = picture.lineage.copy()
-        fed = np.flatnonzero(filtered[at])
+        fed = marked(filtered[at])
         for ids, groups in by_size(tracks.link[fed]):
             there = picture.find(ids)
             lineage[there] = kinship.inherited(rows, fed[groups], lineage[there], memory=True)

@@ -85,7 +85,7 @@ class Motions:
         which nothing was heard of them already."""
         age, speed = np.zeros(len(dt)) if age is None else age, self._config.unknown_speed
         space, frame = self._config.space, self._intake.frame
-        kinds = np.unique(codes)
+        kinds = codes[:1] if (codes == codes[:1]).all() else np.unique(codes)
         if len(kinds) <= 1:
             return predict_tracks(
                 tracks, self.motion(int(kinds[0]) if len(kinds) else -1), space, space, dt, frame, speed, age

@@ -89,6 +89,9 @@ class Unknown:
         """Of pairs with the sum of covariances `spread` (n, n, K): how many components both know (K,), and what to add
         (K,) to log det `spread` so that the others count as plausible values."""
         count, more = np.full(spread.shape[2:], len(spread), dtype=np.intp), np.zeros(spread.shape[2:])
+        diagonal = range(len(spread))
+        if not (spread[diagonal, diagonal] >= self.limit.reshape(-1, *(1,) * (spread.ndim - 2))).any():
+            return count, more
         for k, (limit, plausible) in enumerate(zip(self.limit, self.plausible, strict=True)):
             missing = spread[k, k] >= limit
             if missing.any():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion_service.arrays import Ints
+from fusion_service.arrays import Ints, marked
 from fusion_service.centre import notes
 from fusion_service.centre.intervals import Remembered, remember, silence
 from fusion_service.centre.sources import Source
@@ -30,7 +30,7 @@ def retire(source: Source, said: SourceConfig, time: int, room: int, config: Cen
     if retired or len(source.remembered.id):
         gone = Remembered(table.id[late], table.time[late], table.interval[late])
         source.remembered = remember(source.remembered, gone, source.tracks.id, oldest, room)
-    new = np.flatnonzero(late) if retired and source.arrived else NOTHING
+    new = marked(late) if retired and source.arrived else NOTHING
     if len(new):
         new = new[np.isin(table.id[new], np.concatenate(source.arrived))]
         source.leave("stale", len(new))

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import marked
 from fusion_service.centre.lineage import Kin
 from fusion_service.centre.tracks import Tracks
 
@@ -49,7 +50,7 @@ class Rows:
 
     def linked(self) -> NDArray[np.intp]:
         """Rows that belong to a global track."""
-        return np.flatnonzero(self.tracks.link != NO_TRACK)
+        return marked(self.tracks.link != NO_TRACK)
 
     def inside_mask(self) -> NDArray[np.bool_]:
         """`inside` as a mask (M,)."""
@@ -58,4 +59,4 @@ class Rows:
 
     def inside(self) -> NDArray[np.intp]:
         """Rows that belong to a global track and are fused in it: their newest datum has passed its gate."""
-        return np.flatnonzero(self.inside_mask())
+        return marked(self.inside_mask())

@@ -13,10 +13,10 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, marked
 from fusion_service.centre.words import Codes
 from fusion_service.densities import Mixtures
-from fusion_service.records import altered, columns_of
+from fusion_service.records import altered, columns_of, made
 
 __all__ = [
     "EXTENT_ROWS",
@@ -211,7 +211,7 @@ def join_tracks(parts: Sequence[Columns]) -> Columns:
     first = parts[0]
     if len({len(getattr(part, "extent", ())) for part in parts}) > 1:
         parts = [_with_extents(part) for part in parts]
-    return type(first)(*(np.concatenate(column, axis=-1) for column in zip(*map(columns_of, parts), strict=True)))
+    return made(type(first), [np.concatenate(column, axis=-1) for column in zip(*map(columns_of, parts), strict=True)])
 
 
 def _with_extents(tracks: Columns) -> Columns:
@@ -251,13 +251,13 @@ def padded(tracks: Columns, components: int) -> Columns:
 def taken(columns: Any, rows: Any) -> Any:
     """Columns, (..., T) each, of the given rows (indices or a mask): the same ones where a mask holds for all."""
     if not isinstance(rows, np.ndarray):
-        return type(columns)(*(column[..., rows] for column in columns_of(columns)))
+        return made(type(columns), [column[..., rows] for column in columns_of(columns)])
     if rows.dtype != np.bool_:
-        return type(columns)(*(column.take(rows, axis=-1) for column in columns_of(columns)))
+        return made(type(columns), [column.take(rows, axis=-1) for column in columns_of(columns)])
     if rows.all():
         return columns
-    at = np.flatnonzero(rows)
-    return type(columns)(*(column.take(at, axis=-1, mode="clip") for column in columns_of(columns)))
+    at = marked(rows)
+    return made(type(columns), [column.take(at, axis=-1, mode="clip") for column in columns_of(columns)])
 
 
 def by_id(tracks: Tracks) -> Tracks:

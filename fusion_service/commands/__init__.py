@@ -16,6 +16,7 @@ from fusion_service.commands import (
     explain,
     export,
     hub,
+    keys,
     order,
     record,
     repair,
@@ -28,6 +29,6 @@ __all__ = ["COMMANDS"]
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rpartition(".")[2]: module
-    for module in (hub, run, order, record, demo, check, rules, replay, evaluate, explain, export, repair)
+    for module in (hub, keys, run, order, record, demo, check, rules, replay, evaluate, explain, export, repair)
 }
 """By name, in the order of the help."""

@@ -11,7 +11,8 @@ from fusion_service.process import argument
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "The bus: a Zenoh router that everything else joins."
-EXAMPLE = f"fusion-service hub --listen {DEFAULT_ENDPOINT}"
+EXAMPLE = f"""fusion-service hub --listen {DEFAULT_ENDPOINT}
+  fusion-service hub --listen tls/0.0.0.0:7447 --security keys/hub     certificates: see `fusion-service keys --help`"""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -23,10 +24,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help=f"where to listen (default {DEFAULT_ENDPOINT})",
     )
+    parser.add_argument("--security", metavar="FILE", help="let in only whom this file lists, each in its role")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Route until `stop` is set. Raises `BusError`."""
+    """Route until `stop` is set. Raises `BusError`, `SecurityError`."""
     from fusion_service.bus.hub import run_hub
+    from fusion_service.bus.security import maybe_security
 
-    run_hub(args.listen or [DEFAULT_ENDPOINT], stop)
+    run_hub(args.listen or [DEFAULT_ENDPOINT], stop, maybe_security(args.security))

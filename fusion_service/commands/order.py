@@ -57,26 +57,35 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--who", metavar="NAME", help="who orders (default: the user of this computer)")
     parser.add_argument("--centre", default="centre", metavar="NAME", help="name of the centre (default centre)")
     parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="hub to join")
+    parser.add_argument("--security", metavar="FILE", help="the operator's certificate, whose name is who orders")
     parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Give the order, or list those that stand. Raises `UsageError`, `OrderError`, `BusError`."""
+    """Give the order, or list those that stand. Raises `UsageError`, `OrderError`, `BusError`,
+    `SecurityError`."""
     import msgpack
 
     from fusion_service.bus import DEFAULT_ENDPOINT, open_bus
+    from fusion_service.bus.security import check_party, maybe_security
     from fusion_service.errors import OrderError, UsageError
-    from schemas import global_key
+    from schemas import global_key, order_key
 
+    security = maybe_security(args.security)
+    if security is not None:
+        check_party(security, ("operator",), args.who or "")
+        args.who = security.name
     try:
         key = global_key(args.centre, "orders", args.realm)
+        if security is not None:
+            key = order_key(args.centre, security.name, args.realm)
     except ValueError as error:
         raise UsageError(str(error)) from None
     request = _request(args)
     missing = _missing(request)
     if missing:
         raise UsageError(f"{args.what}: it needs {missing}")
-    with open_bus(args.connect or [DEFAULT_ENDPOINT], wait=ANSWER, stop=stop) as bus:
+    with open_bus(args.connect or [DEFAULT_ENDPOINT], wait=ANSWER, stop=stop, security=security) as bus:
         answers = bus.ask(key, msgpack.packb(request), ANSWER)
     if not answers:
         raise OrderError(f"no centre named {args.centre} answers: is `fusion-service run` there, under this name?")

@@ -35,6 +35,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help=f"hub to join (default {DEFAULT_ENDPOINT})",
     )
+    parser.add_argument("--security", metavar="FILE", help="the recorder's certificate (see `fusion-service keys`)")
     parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
     parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
     parser.add_argument(
@@ -79,8 +80,10 @@ def _address(text: str) -> tuple[str, int]:
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Record until `stop` is set. Raises `UsageError`, `BusError`, `ReviewError`, ImportError, OSError."""
+    """Record until `stop` is set. Raises `UsageError`, `SecurityError`, `BusError`, `ReviewError`,
+    ImportError, OSError."""
     from fusion_service.bus import open_bus
+    from fusion_service.bus.security import maybe_security
     from fusion_service.errors import UsageError
     from fusion_service.recording import Rotation, default_path, run_recorder
     from fusion_service.recording.live import DEFAULT_ADDRESS, Live
@@ -99,13 +102,14 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         raise FileExistsError(f"{path} exists already: name another file, or move it away")
     if (args.live or args.live_web) and args.no_draw:
         raise UsageError("--live shows what is drawn: leave out --no-draw")
+    security = maybe_security(args.security)
     with ExitStack() as stack:
         live = None
         if args.live or args.live_web:
             live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
             stack.callback(live.close)
             print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
-        bus = stack.enter_context(open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop))
+        bus = stack.enter_context(open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop, security=security))
         run_recorder(
             bus,
             path,

@@ -12,7 +12,8 @@ from fusion_service.process import argument
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "The fusion service."
-EXAMPLE = "fusion-service run --config centre.toml"
+EXAMPLE = """fusion-service run --config centre.toml
+  fusion-service run --config centre.toml --security keys/centre-centre"""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -26,11 +27,14 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="hub to join, instead of the config's",
     )
     parser.add_argument("--hub", action="store_true", help="hold a hub in this process too (the smallest installation)")
+    parser.add_argument("--security", metavar="FILE", help="certificates, instead of the config's (see `keys`)")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
-    """Run the service until `stop` is set. Raises `ConfigError`, `BusError`, `StateError`."""
-    from fusion_service.bus import open_bus
+    """Run the service until `stop` is set. Raises `ConfigError`, `BusError`, `SecurityError`,
+    `StateError`."""
+    from fusion_service.bus.hub import open_hub
+    from fusion_service.bus.security import hub_security
     from fusion_service.config import ServiceConfig, load_config
 
     if stop.is_set():  # what follows is slow to load
@@ -40,8 +44,10 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     config = load_config(args.config) if args.config else ServiceConfig()
     if args.connect:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, connect=tuple(args.connect)))
+    if args.security:
+        config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, security=args.security))
     if args.hub:
-        with open_bus(listen=config.bus.connect, mode="router"):
+        with open_hub(config.bus.connect, hub_security(config.bus.security)):
             run_service(config, stop)
     else:
         run_service(config, stop)

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FunctionType, SimpleNamespace
 from typing import Any
 
-from fusion_service.compiled import groups, kernels
+from fusion_service.compiled import groups, kernels, three
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
 
@@ -96,10 +96,12 @@ def _compiled(wanted: bool, stop: threading.Event | None) -> tuple[str, SimpleNa
     for name in SHAPES:
         if stop is not None and stop.is_set():
             return PLAIN, None
-        if name == "intersect":
-            _MADE.update({helper: _kernel(numba, getattr(groups, helper), ()) for helper in HELPERS})
+        home = next(one for one in (kernels, groups, three) if hasattr(one, name))
+        for helper in HELPERS.get(name, ()):
+            if helper not in _MADE:
+                _MADE[helper] = _kernel(numba, getattr(home, helper), ())
         if name not in _MADE:
-            function = getattr(kernels if hasattr(kernels, name) else groups, name)
+            function = getattr(home, name)
             _MADE[name] = _kernel(numba, function, (_signature(numba, name),))
     return f"numba {numba.__version__}", SimpleNamespace(**_MADE)
 
@@ -127,11 +129,16 @@ SHAPES = {
     "congruence": ((2, 3), (3,)),
     "congruence_each": ((3, 3), (3,)),
     "intersect": ((2, 3, 0), (2, 3, 1, 2, 3, 1)),
+    "from_start_of_three": ((4, 3, 1, 2, 1), (2, 3, 2, 2, 1, 1, 1)),
 }
 """Numbers of axes of what each kernel reads, and then writes; 0: places (G, k). `solve` takes a flag at the end."""
-STRIDED = ("invert", "pivots", "ldl", "solve")
+STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three")
 """Kernels that copy what they read into room of their own, so that it need not be contiguous."""
-HELPERS = ("_turned", "_lowered", "_sum", "_copied", "_solved")
+HELPERS = {
+    "intersect": ("_turned", "_lowered", "_sum", "_copied", "_solved"),
+    "from_start_of_three": ("_larger", "_inverted", "_looked_at", "_least_of_three", "_sought"),
+}
+"""What kernels call, in the order in which it is compiled."""
 
 
 def _signature(numba: Any, name: str) -> Any:

@@ -20,11 +20,17 @@ F8 = np.dtype(np.float64)
 
 def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     """By name, over these `kernels` (those of the module, compiled or as they are)."""
-    return {**_inverses(kernels), **_factors(kernels), **_products(kernels), "intersect": _groups(kernels)}
+    return {
+        **_inverses(kernels), **_factors(kernels), **_products(kernels), "intersect": _groups(kernels),
+        "from_start_of_three": _three(kernels),
+    }  # fmt: skip
 
 
 def _fits(a: Floats, *others: Floats) -> bool:
-    return a.dtype == F8 and a.size > 0 and all(one.dtype == F8 for one in others)
+    for one in others:
+        if one.dtype != F8:
+            return False
+    return a.dtype == F8 and a.size > 0
 
 
 def _one(a: Floats, core: int) -> Floats:
@@ -148,3 +154,19 @@ def _groups(kernels: SimpleNamespace) -> Callable[..., Any]:
         return mean, covariance, margin, beside
 
     return intersect
+
+
+def _three(kernels: SimpleNamespace) -> Callable[..., Any]:
+    def from_start_of_three(
+        A: Floats, x: Floats, bound: Floats, start: Floats, limits: tuple[float, ...]
+    ) -> tuple[Floats, ...] | None:
+        """See `three.from_start_of_three`: what it writes."""
+        if not _fits(A, x, bound, start) or A.shape[2] != 3:
+            return None
+        n, size = len(x), x.shape[2]
+        shapes = (n, size), (n, n, size), (3, size), (3, size), (size,), (size,), (size,)
+        made = tuple(np.empty(shape) for shape in shapes)
+        kernels.from_start_of_three(A, x, bound, start, np.array(limits), *made)
+        return made
+
+    return from_start_of_three

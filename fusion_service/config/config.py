@@ -275,6 +275,9 @@ class BusConfig:
 
     realm: str = _setting("fusion", parsed(check_realm), "first part of every key")
     connect: tuple[str, ...] = _setting((DEFAULT_ENDPOINT,), endpoints, "endpoints of the hub to join")
+    security: str | None = _setting(
+        None, maybe(text), "security file or folder of `fusion-service keys`; left out: this file, if it has [security]"
+    )
     queue: int = _setting(10_000, whole(10, 10_000_000), "messages held between bus and centre")
 
 

@@ -45,13 +45,14 @@ def load_config(path: str | Path) -> ServiceConfig:
     problems: Problems = []
     known = {one.name: one for one in fields(ServiceConfig)}
     for name in raw:
-        if name not in known:
+        if name not in known and name != "security":  # fusion_service.bus reads that
             homes = [table for table in known if hasattr(getattr(ServiceConfig(), table), name)]
             where = f": put it under [{homes[0]}]" if homes else f" (known: {', '.join(known)})"
             problems.append(((name,), f"unknown table{where}"))
+    here = BusConfig(security=str(path) if "security" in raw else None)
     config = ServiceConfig(
         centre=_read_centre(raw.get("centre", {}), ("centre",), problems),
-        bus=_read(BusConfig, raw.get("bus", {}), ("bus",), problems),
+        bus=_read(BusConfig, raw.get("bus", {}), ("bus",), problems, here),
         service=_read(DaemonConfig, raw.get("service", {}), ("service",), problems),
     )
     if problems:

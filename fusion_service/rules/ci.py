@@ -14,6 +14,7 @@ from typing import Self
 import numpy as np
 
 from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.compiled import either
 from fusion_service.linalg import inner
 from fusion_service.rules.base.block import Result, Sources, weighted_product
 from fusion_service.rules.base.matrices import diagonal, weighted_sum
@@ -30,6 +31,8 @@ KEPT = 1e-3
 """Weights that are given to start from are kept while their gap is at most this."""
 NEARER = 1e-6
 """Else better ones are sought from there, until their gap is at most this."""
+LIMITS = KEPT, NEARER, float(active.ROUNDS), active.RIDGE, active.NEAR
+"""As `compiled.three` takes them."""
 
 
 def ci(sources: Sources, weights: Floats | None, influence: bool, *, criterion: str) -> Result:
@@ -96,6 +99,29 @@ def _from_start(sources: Sources, influence: bool, criterion: str, rho: float | 
     the best.
 
     The criterion, det P or trace P, is then at most exp(gap) times the smallest."""
+    assert sources.start is not None
+    if sources.count == active.THREE and criterion == "det" and is_one(rho):
+        begun = from_start_of_three(sources.information, sources.means, sources.condition, sources.start, LIMITS)
+        if begun is not None:
+            *columns, found = begun
+            mean, P, w, share, condition, gap = columns
+            result = Result(mean, P, w, share if influence else None, condition, gap)
+            hard = np.flatnonzero(found == 0.0)
+            if len(hard):
+                result.overwrite(hard, _from_start_plain(sources.take(hard), influence, criterion, rho))
+            return result
+    return _from_start_plain(sources, influence, criterion, rho)
+
+
+@either
+def from_start_of_three(
+    A: Floats, x: Floats, bound: Floats, start: Floats, limits: tuple[float, ...]
+) -> tuple[Floats, ...] | None:
+    """What `compiled.three` makes of it; None on the plain road."""
+    return None
+
+
+def _from_start_plain(sources: Sources, influence: bool, criterion: str, rho: float | Floats) -> Result:
     assert sources.start is not None
     model, w = Inflated(sources.information, rho), np.array(sources.start)
     result = _weighed(sources, model, w, influence, criterion, True)

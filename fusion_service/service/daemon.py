@@ -7,6 +7,7 @@ step fail, the centre goes on from its last checkpoint under a new id generation
 
 from __future__ import annotations
 
+import gc
 import logging
 import threading
 import time
@@ -14,6 +15,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from fusion_service.bus import Bus, Inbox, open_bus
+from fusion_service.bus.security import check_party, maybe_security
 from fusion_service.centre import (
     ClockSet,
     Order,
@@ -49,6 +51,7 @@ from schemas import (
     encode,
     global_key,
     local_key,
+    order_key,
     parse_key,
 )
 
@@ -69,13 +72,16 @@ class Arrival(NamedTuple):
 
 
 def run_service(config: ServiceConfig, stop: threading.Event) -> None:
-    """Run until `stop` is set. Raises `BusError`, `StateError` or `ConfigError`, which says in one line why it
-    cannot start."""
+    """Run until `stop` is set. Raises `BusError`, `SecurityError`, `StateError` or `ConfigError`, which says in one
+    line why it cannot start."""
     try:
         begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
         raise ConfigError([f"[service] compiled: {error}"]) from None
-    with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop) as bus:
+    security = maybe_security(config.bus.security)
+    if security is not None:
+        check_party(security, ("centre",), config.centre.name)
+    with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop, security=security) as bus:
         Service(config, bus, state).run(stop)
 
 
@@ -108,6 +114,8 @@ class Service:
         rule = centre.rule if centre.kind == "tracks" else f"{centre.intensity_rule} of intensities"
         log.info("fusing by %s, memory %s, every %g s as %s", rule, centre.memory, centre.period, centre.name)
         status_due = time.monotonic() + self._config.service.status_period
+        gc.collect()
+        gc.freeze()  # what is loaded stays: it is not looked through again in the middle of a step
         while not stop.is_set():
             timeout = max(0.0, status_due - time.monotonic())
             for item in self._take(min(timeout, self._times.wait(time.time_ns()))):
@@ -140,6 +148,7 @@ class Service:
             bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
         bus.answer(global_key(name, "orders", realm), self._desk.answer)
+        bus.answer_each(order_key(name, "*", realm), lambda key, asked: self._desk.answer(asked, key.rsplit("/", 1)[1]))
         bus.announce(global_key(name, "alive", realm))
 
     def _wake_at(self, stop: threading.Event) -> None:

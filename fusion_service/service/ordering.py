@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.centre import NEEDED, WHAT, Centre, Order, View, judge, read_order
-from schemas import check_source
+from schemas import check_name, check_source
 
 __all__ = ["OrderDesk"]
 
@@ -71,9 +71,12 @@ class OrderDesk:
             given, self._given = self._given, []
         return [one for one in stood + given if not whole or one.what in ("mute", "unmute", "quarantine", "release")]
 
-    def answer(self, payload: bytes | None) -> bytes:
-        """The answer to a request. `ValueError` in one line where it is none."""
+    def answer(self, payload: bytes | None, operator: str = "") -> bytes:
+        """The answer to a request. operator: whose key it came on, who is said to have ordered then, whatever the
+        request says. `ValueError` in one line where it is none."""
         raw = _map(payload)
+        if operator:
+            raw = {**raw, "who": check_name(operator)}
         if raw.get("what", "list") == "list":
             with self._lock:
                 return cast(bytes, msgpack.packb({"orders": self._listed, "time": max(self._view.time, 0)}))

@@ -124,7 +124,7 @@ class LastingCentre:
         checkpoint = self.centre.checkpoint() if _settles(result) else None
         sent = time.time_ns()
         tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
-        payloads = {"tracks": encode(tracks), "log": encode(journal)}
+        payloads = {"tracks": encode(tracks, sound=True), "log": encode(journal, sound=True)}
         self._changed = True
         if checkpoint is not None:
             self._keep(checkpoint)

@@ -14,7 +14,7 @@ import pytest
 
 from fusion_service.bus import Bus, BusError, BusStopped, Inbox, open_bus
 from fusion_service.bus.hub import run_hub
-from fusion_service.bus.session import HANDSHAKE
+from fusion_service.bus.joining import HANDSHAKE
 from schemas import MAX_BYTES
 from tests.helpers.processes import Hub, Program, eventually, free_endpoint
 
@@ -368,7 +368,7 @@ class TestJoining:
     def test_waits_for_a_hub_that_comes_later_and_says_so(
         self, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr("fusion_service.bus.session.FIRST", 0.3)
+        monkeypatch.setattr("fusion_service.bus.joining.FIRST", 0.3)
         hub = Hub()
         timer = threading.Timer(0.6, hub.start)
         timer.start()

@@ -97,6 +97,19 @@ def test_by_the_wall_clock_a_scan_ahead_waits_for_its_time_and_silence_is_steppe
     assert run.clock.skipped == 0
 
 
+def test_a_step_without_data_waits_half_a_period_where_steps_were_made_and_gives_way_to_the_next_of_them() -> None:
+    run = Run(clock(delay=0.0))
+    for ms in range(5, 3000, 10):
+        run.comes(ms, *([ms - 2] if ms % 300 == 5 else []))
+    assert run.steps == list(range(3, 3000, 300)), "none at 1000 and 2000"
+    run.comes(3000)
+    assert run.steps[-1] == 2703
+    assert run.clock.wait(START + 3000 * MS) == pytest.approx(0.5)
+    for ms in range(3010, 6010, 10):
+        run.comes(ms)
+        assert run.steps[-1] == (2703 if ms < 3500 else ms // 1000 * 1000), ms
+
+
 def test_a_wall_clock_that_is_set_back_is_told_and_not_waited_for() -> None:
     of = clock()
     assert of.due(START, -1) is None

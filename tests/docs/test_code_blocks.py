@@ -45,6 +45,7 @@ NO_CODE = ("", "text", "mermaid")
 COMMANDS = ("fusion-service", "sensor-client", "python", "make", "docker")
 NOT_RUN = {
     "docker/README.md": [*["needs a container engine"] * 4, "is Compose's"],
+    "docs/security.md": ["it needs the certificates", "it is the file of a hub", "it sets a variable"],
 }
 """All blocks that are not run, with the beginning of the reason that the page gives."""
 UNMARKED = {"docs/rules.md": ("means", "covariances")}
@@ -221,7 +222,7 @@ def command_of(words: list[str]) -> tuple[str, list[str]]:
 
 def check_module(name: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     """`python -m` of ours: a module, or a package whose parser may be in any of its files."""
-    assert name.startswith(("benchmarks.", "tests.schemas.", "fusion_service.rules")), name
+    assert name.startswith(("benchmarks.", "tests.schemas.", "tests.attacks", "fusion_service.rules")), name
     found = importlib.util.find_spec(name)
     assert found is not None, name
     assert found.origin is not None, name
@@ -272,7 +273,8 @@ def test_shell_lines_are_read(block: Block, words: list[str], monkeypatch: pytes
 
 
 TOPICS = {
-    f"fusion-service {name}" for name in ("evaluate", "replay", "explain", "export", "repair", "record", "run", "order")
+    f"fusion-service {name}"
+    for name in ("evaluate", "replay", "explain", "export", "repair", "record", "run", "order", "keys")
 } | {"sensor-client simulate", "sensor-client playback"}
 """In the text, a command may be named without what it must be given."""
 

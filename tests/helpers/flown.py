@@ -155,10 +155,13 @@ def messy(config: dict[str, Any], *, steps: int = 14, targets: int = 8, seed: in
 
 
 def places(
-    flight: Flight, seconds: Sequence[float], seen_by: Callable[[str, float], dict[int, Sequence[float]]]
+    flight: Flight,
+    seconds: Sequence[float],
+    seen_by: Callable[[str, float], dict[int, Sequence[float]]],
+    judging: Sequence[str] = (),
 ) -> None:
     """Fly: at each second every source lists the tracks that `seen_by(source, second)` gives, by id, as (x, y), with
-    a standard deviation of 30 m; the truth of target 1 stands at (0, 0)."""
+    a standard deviation of 30 m; the truth of target 1 stands at (0, 0). judging: sources that report existence."""
     for name in SOURCES:
         flight.put(info(name), seconds[0] - 0.5)
     for second in seconds:
@@ -171,5 +174,7 @@ def places(
         for name in SOURCES:
             listed = seen_by(name, second)
             rows = [[*map(float, place), 0.0, 0.0] for place in listed.values()]
-            flight.put(tracks(name, second, np.array(rows).reshape(-1, 4), list(listed)), second + 0.05)
+            judged = np.full(len(listed), 0.95) if name in judging else None
+            scan = tracks(name, second, np.array(rows).reshape(-1, 4), list(listed), existence=judged)
+            flight.put(scan, second + 0.05)
         flight.step(second)

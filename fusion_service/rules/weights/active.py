@@ -22,6 +22,8 @@ from fusion_service.rules.weights.simplex import gap, gradient
 __all__ = ["DONE", "Model", "best_weights"]
 
 DONE = 0.1 * simplex.GAP
+THREE = 3
+"""Of so many the minimum of the quadratic model is in closed form."""
 SETS = (4, 6, 6, 8, 8)
 """Of more sources, so many are looked at together, in round after round."""
 ROUNDS, EXCHANGES = 10, 12
@@ -171,7 +173,7 @@ def _curvature(criterion: str, model: Model, w: Floats, V: Floats, D: Floats) ->
 def _minimum(H: Floats, c: Floats, free: Bools) -> Floats:
     """The x (N, B) >= 0 of sum 1 with the smallest c'x + x'Hx/2, for H (N, N, B) and c (N, B); `free` (N, B): those
     that may be positive."""
-    if len(c) == 3:
+    if len(c) == THREE:
         return _of_three(H, c)
     N = len(c)
     out, todo = np.empty_like(c), np.arange(c.shape[1])

@@ -209,8 +209,8 @@ def test_who_leaves_and_why(joined: tuple[Path, Flight]) -> None:
 
 
 def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
-    """r1 lists its track no more at 5 s: it ends with the next report; r2 is muted at 8 s: its track coasts for 3 s;
-    track 3 of r3 is deleted by order at 12 s."""
+    """r1, which judges existence, lists its track no more at 5 s: it ends with the next report; r2 is muted at 8 s:
+    its track coasts for 3 s; track 3 of r3 is deleted by order at 12 s."""
     flight = Flight({"coast": 3.0})
 
     def seen_by(name: str, second: float) -> dict[int, Sequence[float]]:
@@ -218,7 +218,7 @@ def test_a_coasting_end_an_order_a_silence_and_refusals(tmp_path: Path) -> None:
             return {5: spread(0)} if second < 5 else {}
         return {6: spread(20_000)} if name == "r2" else {7: spread(40_000)}
 
-    places(flight, range(1, 8), seen_by)
+    places(flight, range(1, 8), seen_by, ["r1"])
     flight.centre.handle(Order("mute", "r2", who="anna", why="noise"), START)
     places(flight, range(8, 12), seen_by)
     flight.centre.handle(Order("delete", track=int(flight.steps[-1].tracks.ids[-1])), START)
