@@ -49,6 +49,8 @@ __all__ = [
     "CentreConfig",
     "ConfigError",
     "DaemonConfig",
+    "FlowConfig",
+    "LimitsConfig",
     "ServiceConfig",
     "SourceConfig",
     "config_hash",
@@ -296,12 +298,32 @@ class DaemonConfig:
 
 
 @dataclass(frozen=True)
+class FlowConfig:
+    """How much is taken of one source; 0: any."""
+
+    messages: float = _setting(
+        5e3, number(0, 1e9), "messages a second from one source; what is beyond any limit is dropped (flow); 0: none is"
+    )
+    bytes: float = _setting(1e8, number(0, 1e12), "bytes a second")
+    tracks: float = _setting(1e6, number(0, 1e12), "tracks a second, or components of intensities")
+    burst: float = _setting(2.0, number(0.01, 3600), "seconds of all this that may come at once")
+
+
+@dataclass(frozen=True)
+class LimitsConfig(FlowConfig):
+    """The same for each source, but for those named."""
+
+    sources: dict[str, FlowConfig] = _setting({}, table, "by name, over the others")
+
+
+@dataclass(frozen=True)
 class ServiceConfig:
     """The whole file."""
 
     centre: CentreConfig = CentreConfig()
     bus: BusConfig = BusConfig()
     service: DaemonConfig = DaemonConfig()
+    limits: LimitsConfig = LimitsConfig()
 
 
 def config_hash(config: CentreConfig) -> str:

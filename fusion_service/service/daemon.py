@@ -30,6 +30,7 @@ from fusion_service.centre import (
 from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.flow import Flow
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.overload import Overload, overtaken
@@ -98,7 +99,8 @@ class Service:
         self._tokens = Tokens(self._inbox.wake)
         self._desk = OrderDesk(lambda order: self._inbox.put("", order))
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
-        self._times = StepTimes(config.centre)
+        self._times = StepTimes(config.centre, authenticated=config.bus.security is not None)
+        self._flow = Flow(config.limits)
         self._overload = Overload(self._times.patience)
         self._dropped: Counter[str] = Counter()
         self._result: StepResult | None = None
@@ -159,9 +161,9 @@ class Service:
 
     def _on_sample(self, key: str, data: bytes) -> None:
         scope, name, _ = key.rsplit("/", 3)[-3:]
-        self._inbox.put(
-            centre_source(name) if scope == "global" else name, Arrival(key, data, time.time_ns()), len(data)
-        )
+        source = centre_source(name) if scope == "global" else name
+        if self._flow.takes(source, len(data)):
+            self._inbox.put(source, Arrival(key, data, time.time_ns()), len(data))
 
     def _on_miss(self, key: str, count: int) -> None:
         self._counts["missed"] += count
@@ -204,6 +206,7 @@ class Service:
         if source_of(message) != name:
             self._lasting.handle(Refused(name, "source"), item.received)
             return
+        self._flow.read(name, message)
         fault = ""
         if isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)):
             fault = self._times.fault(message, item.received)
@@ -228,6 +231,11 @@ class Service:
             if new := total - self._dropped[name]:
                 self._dropped[name] = total
                 self._lasting.handle(Refused(name, "queue", new, dropped=True), time.time_ns())
+        beyond = self._flow.news()
+        for name, new in beyond.items():
+            self._lasting.handle(Refused(name[:64], "flow", new, dropped=True), time.time_ns())
+        if beyond:
+            self._told.warn("%s", self._flow.line(beyond))
 
     def _step_all(self, stop: threading.Event) -> None:
         while not stop.is_set():
@@ -292,6 +300,7 @@ class Service:
             skipped=self._times.skipped,
             overload=None if self._overload.since is None else time.monotonic() - self._overload.since,
         )
+        status = self._flow.told_in(status)
         if self._overload.since is not None and status.notes:
             self._told.warn("%s", status.notes[0])
         self._out["status"].put(encode(status))
