@@ -20,13 +20,17 @@ from schemas.structure import SHAPE
 from schemas.tables import CLASSES, FIELDS
 from schemas.values import check_symmetric
 
-__all__ = ["MAX_BYTES", "MAX_ITEMS", "VERSION", "decode", "digest", "encode"]
+__all__ = ["MAX_BYTES", "MAX_ITEMS", "MAX_KEYS", "MAX_NAMES", "VERSION", "decode", "digest", "encode"]
 
 VERSION = 1
 MAX_BYTES = 16 * 2**20
 """A payload above this size is refused before it is read."""
 MAX_ITEMS = 2**16
 """A list with more items is refused: lists in lists that each announce millions cost far more than their bytes."""
+MAX_KEYS = 256
+"""A map with more keys is refused, but for those of a status or a log, which may name more sources:"""
+MAX_NAMES = 8192
+NAMING = ("status", "step_log")
 
 _SLOTS = {kind: [(field.name, getattr(kind, field.name).__set__) for field in fields(kind)] for kind in FIELDS}
 """The attributes of each message, set one by one in `decode`: half the time of a frozen dataclass's own `__init__`."""
@@ -80,13 +84,38 @@ def _pack(message: Message) -> bytes:
         raise MessageError("bad-field", f"{kind.type}.{key}: {error}") from None
 
 
+def _unpacked(data: bytes, keys: int) -> Any:
+    """What MessagePack makes of `data`, where no map in it has more than so many keys: those of a message that may name
+    many sources, `MAX_NAMES`."""
+    try:
+        return msgpack.unpackb(data, max_array_len=min(len(data), MAX_ITEMS), max_map_len=min(len(data), keys))
+    except ValueError:
+        if keys >= MAX_NAMES or _type_of(data) not in NAMING:
+            raise
+        return _unpacked(data, MAX_NAMES)
+
+
+def _type_of(data: bytes) -> Any:
+    """The `type` that a message says, of the first `MAX_KEYS` keys; the values are passed over."""
+    unpacker = msgpack.Unpacker(max_buffer_size=max(len(data), 1))
+    unpacker.feed(data)
+    try:
+        for _ in range(min(unpacker.read_map_header(), MAX_KEYS)):
+            if unpacker.unpack() == "type":
+                return unpacker.unpack()
+            unpacker.skip()
+    except (ValueError, TypeError, msgpack.exceptions.UnpackException, RecursionError):
+        pass
+    return None
+
+
 def decode(data: bytes) -> Message:
     """The message in `data`. `MessageError` with one of `schemas.REASONS`. Arrays are read-only; keys that
     this version does not know are ignored."""
     if len(data) > MAX_BYTES:
         raise MessageError("too-large", f"{len(data)} bytes, more than {MAX_BYTES}")
     try:
-        raw = msgpack.unpackb(data, max_array_len=min(len(data), MAX_ITEMS))
+        raw = _unpacked(data, MAX_KEYS)
     except (ValueError, TypeError, RecursionError, MemoryError) as error:
         raise MessageError("not-msgpack", str(error) or type(error).__name__) from None
     if type(raw) is not dict:

@@ -43,7 +43,7 @@ SECTIONS = {
         ),
         *("tracklets", "late", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
     ],
-    "How good, how fast": ["measurements", "worlds", "studies", "performance", "rules-speed"],
+    "How good, how fast": ["measurements", "worlds", "studies", "performance", "rules-speed", "reliability"],
     "API": ["api/*"],
     "Carry it on": ["architecture", "threats", "decisions/README", "contributing", "changelog"],
 }

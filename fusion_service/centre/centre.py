@@ -35,6 +35,7 @@ from fusion_service.centre.naming import Book
 from fusion_service.centre.obeying import heirs, obey, view_of
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.publishing import Contributions, picture_message
+from fusion_service.centre.quieting import rest
 from fusion_service.centre.revising import Revision
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.status import step_status
@@ -164,6 +165,7 @@ class Centre(ABC):
         past = self._begin_step(time, self._history.noted() if events is None else events, left)
         journal = self._journal
         self._obey(self._intake.take_orders(), time)
+        rest(self._intake, self._time, journal)
         self._forget_lineages()
         told = len(journal.taken())  # of what was late
         self._intake.admit(time, self._time, journal)

@@ -29,7 +29,7 @@ from fusion_service.config.correlation import group_bounds, is_derived
 from fusion_service.rules import Fused, fuse_last
 from schemas import Motion
 
-__all__ = ["AUTO", "Correlation", "Ways", "declared_correlation", "declared_motions", "sound_rows"]
+__all__ = ["AUTO", "BY_UNION", "Correlation", "Ways", "declared_correlation", "declared_motions", "sound_rows"]
 
 AUTO = "auto"
 Ways = NDArray[np.uint8]

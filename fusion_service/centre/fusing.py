@@ -20,7 +20,8 @@ from fusion_service.arrays import Bools, Floats, Ints, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
-from fusion_service.centre.correlation import AUTO, Correlation, Ways
+from fusion_service.centre.bounding import union_bound
+from fusion_service.centre.correlation import AUTO, BY_UNION, Correlation, Ways
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown
@@ -151,13 +152,22 @@ class Ruled:
             one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
             bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
             if bad.any():
-                one[:, bad], spread[:, :, bad] = uniform_ci(x[:, :, bad], P[:, :, :, bad])
+                self._mend(one, spread, bad, bad & ((by[at] == BY_UNION) | (name == "cu")), x, P)
                 gains[:, bad] = 1.0 / len(x)
-                self.journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
             return one, spread, gains
 
         information = name == AUTO or RULES[name].information
         return fuse_known(means, covariances, weights, self.unknown, information, rule)
+
+    def _mend(self, one: Floats, spread: Floats, bad: Bools, union: Bools, x: Floats, P: Floats) -> None:
+        """Put what is conservative for the rule in the place of what it could not fuse, and say so: equal-weight
+        intersection, or where all is to be covered, of `union`, what is above all."""
+        rest = bad & ~union
+        one[:, rest], spread[:, :, rest] = uniform_ci(x[:, :, rest], P[:, :, :, rest])
+        if union.any():
+            one[:, union], spread[:, :, union] = union_bound(x[:, :, union], P[:, :, :, union])
+            self.journal.event({"kind": "union-bound", "tracks": int(union.sum())})
+        self.journal.refuse(Entry("", 0, 0, 0, "fusion", int(bad.sum())))
 
     def kin(self, means: Floats, covariances: Floats) -> tuple[Floats, Floats, Floats]:
         """Groups whose rows have data in common (see `kinship`): what is derived of rows holds for no result of

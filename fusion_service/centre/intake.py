@@ -11,9 +11,9 @@ from itertools import groupby
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from fusion_service.centre import notes
+from fusion_service.centre import limits, notes
+from fusion_service.centre.batches import Checked, framed, run_key
 from fusion_service.centre.clock import horizon
 from fusion_service.centre.declared import declared_by, loosened, motion_declared, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
@@ -22,22 +22,15 @@ from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name
 from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, silence_of
 from fusion_service.centre.journal import Journal
-from fusion_service.centre.limits import (
-    MAX_COMPONENTS,
-    MAX_EVENTS,
-    MAX_ORDERS,
-    MAX_QUEUED,
-    MAX_SOURCES,
-    MAX_TOTAL,
-    MAX_TRACKS,
-)
 from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.pictures import as_scan, is_picture_of, source_of
 from fusion_service.centre.refusing import fault
+from fusion_service.centre.resting import Resting, gone
 from fusion_service.centre.scans import Scan, as_tracks, message_tracks, size_of
 from fusion_service.centre.sources import Source
 from fusion_service.centre.spared import Spared
+from fusion_service.centre.sparing import affordable
 from fusion_service.centre.tracks import Tracks, empty_tracks
 from fusion_service.centre.treatment import AS_IT_IS, Treatment
 from fusion_service.centre.words import Lexicon, Words
@@ -64,7 +57,6 @@ __all__ = ["Intake"]
 
 _Queued: TypeAlias = tuple[Message, int]
 _Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]
-_Checked: TypeAlias = tuple[tuple[Source, LocalTracks, Entry], NDArray[np.uint8]]
 
 
 class Intake:
@@ -76,6 +68,7 @@ class Intake:
         self.voting = FrameVoting()
         self.reframed = False
         self.sources: dict[str, Source] = {}
+        self.resting: dict[str, Resting] = {}
         self.queue: list[_Queued] = []
         self.raw: dict[tuple[str, int, int, int], tuple[Message, int, int]] = {}
         self._held: Counter[str] = Counter()
@@ -94,10 +87,12 @@ class Intake:
         """Queue an event, but not one of the clock; messages beyond `max_pending` of one source, or `MAX_QUEUED` or
         `MAX_COMPONENTS` of all together, are dropped and counted."""
         if isinstance(event, (SourceFound, SourceLost)):
-            if event.source in self._present or len(self._present) < 2 * MAX_SOURCES:
+            self.wake(event.source)
+            if event.source in self._present or len(self._present) < 2 * limits.MAX_SOURCES:
                 self._present[event.source] = isinstance(event, SourceFound)
         elif isinstance(event, Order):
-            if len(self._given) < MAX_ORDERS:
+            self.wake(event.source or "")
+            if len(self._given) < limits.MAX_ORDERS:
                 self._given.append(event)
         elif isinstance(event, Refused):
             self._count(event.source, event.reason, max(event.count, 1), event.dropped)
@@ -110,6 +105,7 @@ class Intake:
 
     def hold(self, event: Message, received: int) -> None:
         """Queue a message, whatever there is."""
+        self.wake(source_of(event))
         self.queue.append((event, received))
         self._held[source_of(event)] += 1
         self._components += size_of(event)
@@ -124,13 +120,24 @@ class Intake:
         """Take over what is queued in `other` beside messages."""
         self._given, self._present, self._refused = other._given, other._present, other._refused
 
+    def wake(self, name: str) -> None:
+        """Something is said by, or of, a source that may rest (see `resting`): it does no more."""
+        if name in self.resting:
+            one = self.resting.pop(name)
+            source = self.sources[name] = one.woken()
+            source.muted = self.config.source(name).ignore or name in self.orders.about("mute")
+
+    def waits_for(self, name: str) -> bool:
+        """Whether a message of this source is queued, or its token came or went."""
+        return self._held[name] > 0 or name in self._present
+
     def _is_full(self, message: Message) -> bool:
-        full = len(self.queue) >= MAX_QUEUED or self._components + size_of(message) > MAX_COMPONENTS
+        full = len(self.queue) >= limits.MAX_QUEUED or self._components + size_of(message) > limits.MAX_COMPONENTS
         return full or self._held[source_of(message)] >= self.config.max_pending
 
     def _count(self, source: str, reason: str, count: int, dropped: bool) -> None:
         key = (source, reason, dropped)
-        if key not in self._refused and len(self._refused) >= MAX_EVENTS:
+        if key not in self._refused and len(self._refused) >= limits.MAX_EVENTS:
             key = ("*", reason, dropped)
         self._refused[key] += count
 
@@ -197,6 +204,8 @@ class Intake:
 
     def rebase(self, time: int, now: int) -> None:
         """A new era begins at `time`, ns: nothing that is known is later, nor did it come after `now`."""
+        for name in sorted(self.resting):
+            self.wake(name)
         rebase_sources(self.sources.values(), time)
         self.voting.asked = min(self.voting.asked, time)
         self.queue = [(event, min(received, now)) for event, received in self.queue]
@@ -227,7 +236,7 @@ class Intake:
         for (name, reason, dropped), count in sorted(self._refused.items()):
             (journal.drop if dropped else journal.refuse)(Entry(name, 0, 0, 0, reason, count))
         self.spared.note({name for name, _, dropped in self._refused if dropped}, time)
-        self._present, self._refused = {}, Counter()
+        self._present, self._refused, self._dead = {}, Counter(), None
         self._accept(self._due(time, journal), time, last, journal)
 
     def _due(self, time: int, journal: Journal) -> list[_Keyed]:
@@ -254,7 +263,7 @@ class Intake:
         return due
 
     def _presence(self, name: str, found: bool, journal: Journal) -> None:
-        source = self.admitted(name)
+        source = self.admitted(name, speaks=False)
         if source is None:
             journal.refuse(Entry(name, 0, 0, 0, "too-many-sources"))
         elif source.alive is not found:
@@ -264,7 +273,7 @@ class Intake:
     @property
     def is_full(self) -> bool:
         """Whether there is no room for another source but in place of one that is dead."""
-        return len(self.sources) >= MAX_SOURCES
+        return len(self.sources) + len(self.resting) >= limits.MAX_SOURCES
 
     def blank(self, name: str) -> Source:
         """A source of which nothing is known."""
@@ -272,21 +281,23 @@ class Intake:
         source.muted = self.config.source(name).ignore or name in self.orders.about("mute")
         return source
 
-    def admitted(self, name: str) -> Source | None:
-        """The source of that name, made if there is room: the longest silent dead one goes for it."""
+    def admitted(self, name: str, speaks: bool = True) -> Source | None:
+        """The source of that name, made if there is room: the longest silent dead one goes for it, and for one that
+        speaks one of which there was nothing but a token."""
+        self.wake(name)
         if name in self.sources:
             return self.sources[name]
         try:
             check_source(name)
         except ValueError:
             return None
-        if len(self.sources) >= MAX_SOURCES:
+        if self.is_full and name not in self.config.sources:
             if self._dead is None:
-                dead = [s for s in self.sources.values() if s.alive is not True and not len(s.tracks.id)]
-                self._dead = [s.name for s in sorted(dead, key=lambda s: (s.last, s.name), reverse=True)]
+                self._dead = gone(self.sources.values(), self.resting.values(), speaks)
             if not self._dead:
                 return None
-            del self.sources[self._dead.pop()]
+            longest = self._dead.pop()
+            del (self.resting if longest in self.resting else self.sources)[longest]
         self.sources[name] = self.blank(name)
         return self.sources[name]
 
@@ -320,7 +331,7 @@ class Intake:
                 tracks.append((source, message, entry))
         self._apply(tracks, time, journal)
 
-    def _settle_frame(self, checked: list[_Checked], time: int, journal: Journal) -> None:
+    def _settle_frame(self, checked: list[Checked], time: int, journal: Journal) -> None:
         """Let the sources that speak vote on the frame of the picture (see `frames`)."""
         for (source, message, _), faults in checked:
             if (faults == 0).any():
@@ -351,9 +362,10 @@ class Intake:
             ((source, as_tracks(message, faults), entry), faults)
             for (source, message, entry), faults in zip(items, codes, strict=True)
         ]
+        checked = affordable(checked, self.config, journal)
         self._settle_frame(checked, time, journal)
-        checked = [((source, _framed(one, self.frame), entry), faults) for (source, one, entry), faults in checked]
-        for _, run in groupby(enumerate(checked), key=_run_key):
+        checked = [((source, framed(one, self.frame), entry), faults) for (source, one, entry), faults in checked]
+        for _, run in groupby(enumerate(checked), key=run_key):
             batch = [item for _, item in run]
             source, first, _ = batch[0][0]
             for (_, _, entry), faults in batch:
@@ -376,24 +388,12 @@ class Intake:
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))
             else:
-                room = MAX_TOTAL - sum(len(other.tracks.id) for other in self.sources.values() if other is not source)
+                room = limits.MAX_TOTAL - sum(
+                    len(other.tracks.id) for other in self.sources.values() if other is not source
+                )
                 pace = self.pace(source, first.complete)
-                most, follow = min(room, MAX_TRACKS), self.config.follows
+                most, follow = min(room, limits.MAX_TRACKS), self.config.follows
                 reason = "" if source.apply(messages, new, most, pace, follow) else "too-many-tracks"
             if reason:
                 for (_, message, entry), _ in batch:
                     journal.refuse(replace(entry, reason=reason, count=len(message.ids)))
-
-
-def _framed(message: LocalTracks, frame: Frame | None) -> LocalTracks:
-    """A scan; an empty picture of another centre is in the frame that this one has by now: it may have had none."""
-    if frame is None or len(message.ids) or message.frame == frame or not is_picture_of(message.source):
-        return message
-    return replace(message, frame=frame)
-
-
-def _run_key(item: tuple[int, tuple[tuple[Source, LocalTracks, Entry], object]]) -> tuple[object, ...]:
-    """Messages in a row that may be taken together: of one source, all partial, in one space and frame."""
-    place, ((source, message, _), _) = item
-    alone = place if message.complete else -1
-    return source.name, alone, message.space, message.frame, message.height

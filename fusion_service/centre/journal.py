@@ -90,7 +90,8 @@ class Journal:
 
     def drop(self, entry: Entry) -> None:
         """`count` messages of a source lost to a full queue."""
-        self.dropped[entry.source] += max(entry.count, 1)
+        known = entry.source in self.dropped or len(self.dropped) < MOST_ENTRIES
+        self.dropped[entry.source if known else "*"] += max(entry.count, 1)
         self._dropped.append(entry)
 
     def decide(

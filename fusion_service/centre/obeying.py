@@ -34,7 +34,7 @@ def view_of(intake: Intake, picture: Picture, time: int) -> View:
     return View(
         time,
         picture.id,
-        intake.sources,
+        {**intake.sources, **intake.resting} if intake.resting else intake.sources,
         intake.orders.standing,
         ignored,
         intake.config.kind == "intensity",

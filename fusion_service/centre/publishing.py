@@ -71,6 +71,7 @@ def picture_message(
     config, names = intake.config, intake.names()
     picture, contributions = _published(picture, contributions, intake)
     origins = {source.origin for source in intake.sources.values() if source.messages}
+    origins.update(one.origin for one in intake.resting.values() if one.messages)
     origin = max(origins, key=ORIGINS.index, default="live")
     return GlobalTracks(
         source=config.name,

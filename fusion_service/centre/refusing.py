@@ -2,7 +2,7 @@
 
 Reasons, beside those of `schemas.MessageError` (what cannot be decoded) and `schemas.FAULTS` (bad
 numbers): type, muted, origin, loop, future, old-epoch, repeat, late, space, frame, intensity (or tracks: what this
-centre does not fuse), length, bad-info, too-many-tracks, too-many-sources.
+centre does not fuse), length, bad-info, too-many-components, too-many-tracks, too-many-sources, failed (see `trying`).
 """
 
 from __future__ import annotations
@@ -54,4 +54,15 @@ def fault(
         return "space"
     if isinstance(message, LocalIntensity) is not (config.kind == "intensity"):
         return "intensity" if isinstance(message, LocalIntensity) else "tracks"
-    return "" if fits(message) else "length"
+    if not fits(message):
+        return "length"
+    return "too-many-components" if _is_heavy(message, config) else ""
+
+
+def _is_heavy(message: LocalTracks | LocalIntensity, config: CentreConfig) -> bool:
+    """Whether it has more components than the config allows: of a track, or of all its tracks, each counted as large as
+    the largest, which is what they cost."""
+    if isinstance(message, LocalIntensity):
+        return len(message.weights) > config.message_components
+    most = 1 if message.counts is None else int(message.counts.max(initial=1))
+    return most > config.track_components or most * len(message.ids) > config.message_components

@@ -108,7 +108,9 @@ class Revision:
         one it goes on under}. The time of the first step that is otherwise, ns; None where nothing has come of it."""
         for entry in self._taken:
             journal.accept(entry)
-            self._history.reordered[entry.source] += self._overtaken(entry)
+            known = self._history.reordered
+            if self._overtaken(entry) and (entry.source in known or len(known) < 2 * MOST_TOLD):
+                known[entry.source] += 1
         for entry in self._refused:
             journal.refuse(entry)
         if not self._moved:

@@ -40,7 +40,8 @@ def step_status(
         sources={
             name: _told(_health(source, intake, journal, log.time) | dict((more or {}).get(name, {})))
             for name, source in sorted(intake.sources.items())
-        },
+        }
+        | {name: one.said for name, one in sorted(intake.resting.items())},
         tracks=tracks,
         step_time={},
         notes=told,

@@ -57,9 +57,20 @@ __all__ = [
 ]
 
 
-LATER = ("trigger", "arrival_spacing", "revise", "weights", "compiled", "clock_votes")
+LATER = (
+    *("trigger", "arrival_spacing", "revise", "weights", "compiled", "clock_votes"),
+    *("track_components", "message_components", "component_pairs", "forget"),
+)
 """Settings that came after hashes were recorded; their defaults are what there was before, or `BEFORE` says."""
-BEFORE: dict[str, Any] = {"revise": 0.0, "weights": "best", "clock_votes": "all"}
+BEFORE: dict[str, Any] = {
+    "revise": 0.0,
+    "weights": "best",
+    "clock_votes": "all",
+    "track_components": 2**16,
+    "message_components": 2**24,
+    "component_pairs": 2**62,
+    "forget": 0.0,
+}
 """What stands where recorded settings do not say them."""
 
 
@@ -165,6 +176,16 @@ class CentreConfig:
     mixture_rule: str = _setting("moments", read_mixture_rule, "rule for mixtures; moments: as Gaussians, by the rule")
     mixture_options: dict[str, Any] = _setting({}, table, "options of the mixture rule")
     max_components: int = _setting(8, whole(1, 100), "components kept of a mixture")
+    track_components: int = _setting(100, whole(1, 2**16), "a track of more components is refused, with its message")
+    message_components: int = _setting(
+        50_000, whole(1, 2**24), "so is one of more: its tracks times the most components that one of them has"
+    )
+    component_pairs: int = _setting(
+        250_000,
+        whole(0, 2**62),
+        "pairs of components compared in one step, at most; beyond, the mixtures of the messages with most of them are "
+        "taken by their moments, as Gaussians",
+    )
     publish: str = _setting("mixture", choice("mixture", "mean", "mode"), "how a track that is a mixture goes out")
     publish_status: tuple[str, ...] = _setting(
         STATUSES, parsed(known_statuses, texts), "tracks of these go out: tentative, confirmed, coasting"
@@ -209,6 +230,9 @@ class CentreConfig:
     coast_periods: float = _setting(3.0, number(0, 1e3), "... or so many of its source's periods, if that is longer")
     stale_periods: float = _setting(
         3.0, number(1, 1e6), "a source (or track) is stale after so many of its own periods, and lateness"
+    )
+    forget: float = _setting(
+        300.0, DURATION, "seconds after which a source that is gone and silent is forgotten; 0: none is, nor rests"
     )
     remember: float = _setting(600.0, DURATION, "seconds for which a stale track's id and interval are remembered")
     intensity_rule: str = _setting(

@@ -25,7 +25,8 @@ __all__ = ["default_path", "run_recorder"]
 log = logging.getLogger(__name__)
 
 CAPACITY = 65536
-"""Slots between bus and recorder, 64 kB each."""
+SLOT = 4096
+"""Slots between bus and recorder, and their bytes: 256 MiB in all."""
 POLL = 0.1
 """Seconds after which a set `stop` is seen."""
 
@@ -66,7 +67,7 @@ def run_recorder(
     came since the last. on_tick: called after each. The rest, and what is raised, as in `Recorder`; the file is made
     when the subscription stands.
     """
-    inbox: Inbox[Item] = Inbox(CAPACITY)
+    inbox: Inbox[Item] = Inbox(CAPACITY, slot_bytes=SLOT)
 
     def put(key: str, said: bytes | bool | int) -> None:
         inbox.put(key, (key, said, time.time_ns()), len(said) if isinstance(said, bytes) else 0)
@@ -122,6 +123,8 @@ def _note_dropped(inbox: Inbox[Item], recorder: Recorder, before: Counter[str]) 
 
 def _take(inbox: Inbox[Item], recorder: Recorder, timeout: float) -> None:
     for _, (key, said, received) in inbox.take(timeout):
+        if recorder.heavy:
+            recorder.tick()
         if isinstance(said, bytes):
             recorder.handle(key, said, received)
         elif isinstance(said, bool):

@@ -95,6 +95,7 @@ class Recorder:
         self._draw = draw
         self._focus = focus
         self._live = live
+        self._ticked = 0
         self._bad: Counter[tuple[str, str]] = Counter()
         self._infos: dict[str, tuple[int, int, str, bytes, int]] = {}
         self._arrival = self._repeated = 0
@@ -145,6 +146,11 @@ class Recorder:
         """Tracks or messages that were recorded but not drawn, by reason."""
         return self._scene.undrawn
 
+    @property
+    def heavy(self) -> bool:
+        """Whether so many bytes wait for a tick that one should be made before the next message."""
+        return self.bytes - self._ticked >= HEAVY
+
     def handle(self, key: str, data: bytes, received: int) -> None:
         """Queue one message for the next `tick`; `received`: when it came, ns UTC."""
         message: Message | None = None
@@ -179,6 +185,7 @@ class Recorder:
     def tick(self) -> None:
         """Hand what came since the last tick to the operating system, and every few seconds what was drawn; end a
         part that is full. `OSError` if that cannot be written, or the disk is all but full."""
+        self._ticked = self.bytes
         self._write(DRAWN_EVERY)
         self._flush()
         if self._live is not None:

@@ -11,6 +11,9 @@ __all__ = ["BoundedLog"]
 LOUD = 10.0
 """Seconds between two lines of the same words about what is wrong."""
 
+MOST_TOLD = 1000
+"""Words that are remembered: sources write some of them."""
+
 log = logging.getLogger(__name__)
 
 
@@ -27,6 +30,8 @@ class BoundedLog:
         now = time.monotonic()
         if now - self._told.get(what, float("-inf")) < interval:
             return False
+        if len(self._told) >= MOST_TOLD:
+            self._told.clear()
         self._told[what] = now
         return True
 

@@ -31,6 +31,7 @@ from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.flow import Flow
+from fusion_service.service.heartbeat import Heartbeat
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.overload import Overload, overtaken
@@ -60,6 +61,9 @@ __all__ = ["Service", "run_service"]
 
 KEPT = 32
 """Pictures and step logs that can be had again by who missed one: the recorder, above all."""
+
+MOST_WAITING = 64 * 2**20
+"""Bytes between bus and centre: `queue` slots of as many each."""
 
 log = logging.getLogger(__name__)
 
@@ -92,7 +96,9 @@ class Service:
     def __init__(self, config: ServiceConfig, bus: Bus, state: State) -> None:
         self._config = config
         self._bus = bus
-        self._inbox: Inbox[Arrival | Order] = Inbox(config.bus.queue)
+        self._inbox: Inbox[Arrival | Order] = Inbox(
+            config.bus.queue, slot_bytes=max(1, MOST_WAITING // config.bus.queue)
+        )
         self._status = StatusMaker(config.centre.name)
         self._counts = self._status.counts
         self._told = BoundedLog(config.service.log_refusals)
@@ -104,8 +110,13 @@ class Service:
         self._overload = Overload(self._times.patience)
         self._dropped: Counter[str] = Counter()
         self._result: StepResult | None = None
+        self._stepped = False
+        self._status_due = time.monotonic() + config.service.status_period
         self._taken = 0
         """When everything that had come was taken from the inbox, ns."""
+        self._refused: dict[str, int] = {}
+        self._saying = threading.Lock()
+        self._heart = Heartbeat(config.service.status_period, self._say_late)
 
     def run(self, stop: threading.Event) -> None:
         """Work until `stop` is set."""
@@ -115,26 +126,40 @@ class Service:
         centre = self._config.centre
         rule = centre.rule if centre.kind == "tracks" else f"{centre.intensity_rule} of intensities"
         log.info("fusing by %s, memory %s, every %g s as %s", rule, centre.memory, centre.period, centre.name)
-        status_due = time.monotonic() + self._config.service.status_period
         gc.collect()
         gc.freeze()  # what is loaded stays: it is not looked through again in the middle of a step
-        while not stop.is_set():
-            timeout = max(0.0, status_due - time.monotonic())
-            for item in self._take(min(timeout, self._times.wait(time.time_ns()))):
-                if stop.is_set():
-                    break
-                self._receive(item)
-            changed = self._note_tokens()
-            self._note_drops()
-            self._step_all(stop)
-            self._lasting.save()
-            if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= status_due:
-                status_due = time.monotonic() + self._config.service.status_period
-                notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
+        with self._heart:
+            while not stop.is_set():
+                try:
+                    self._turn(stop)
+                except Exception:  # a fault of ours: the next turn may be better
+                    self._counts["failed_turns"] += 1
+                    self._told.error("the loop failed %d times", self._counts["failed_turns"])
+                    stop.wait(0.1)
         notify("STOPPING=1")
         self._lasting.save(at_once=True)
         self._publish_status()
         log.info("stopped after %d steps", self._counts["steps"])
+
+    def _turn(self, stop: threading.Event) -> None:
+        """Take what has come, make a step if one is due, and say how it goes. At most one step between two readings of
+        the inbox."""
+        self._heart.turned()
+        wait = 0.0 if self._stepped else max(0.0, min(self._status_due - time.monotonic(), self._wait()))
+        for item in self._take(wait):
+            if stop.is_set():
+                break
+            self._receive(item)
+        changed = self._note_tokens()
+        self._note_drops()
+        self._stepped = not stop.is_set() and self._step_due()
+        self._lasting.save()
+        if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= self._status_due:
+            self._status_due = time.monotonic() + self._config.service.status_period
+            notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
+
+    def _wait(self) -> float:
+        return self._times.wait(time.time_ns())
 
     def _declare(self) -> None:
         realm, name, bus = self._config.bus.realm, self._config.centre.name, self._bus
@@ -190,7 +215,8 @@ class Service:
     def _receive(self, item: Arrival | Order) -> None:
         if isinstance(item, Order):
             fault = f": {item.refused}" * bool(item.refused)
-            log.info("order %d of %s: %s%s", item.number, item.who or "?", item.what, fault)
+            if self._told.allows(f"orders {item.number % 20}", 1.0):  # twenty lines a second: the step log has them all
+                log.info("order %d of %s: %s%s", item.number, item.who or "?", item.what, fault)
             self._lasting.handle(item, time.time_ns())
             return
         self._counts["messages"] += 1
@@ -235,21 +261,22 @@ class Service:
         for name, new in beyond.items():
             self._lasting.handle(Refused(name[:64], "flow", new, dropped=True), time.time_ns())
         if beyond:
-            self._told.warn("%s", self._flow.line(beyond))
+            self._told.warn("flow: %s", self._flow.line(beyond))
 
-    def _step_all(self, stop: threading.Event) -> None:
-        while not stop.is_set():
-            due = self._times.due(self._taken, self._lasting.centre.time)
-            if due is None:
-                return
-            if skipped := self._times.untold():
-                self._lasting.handle(Skipped(skipped), time.time_ns())
-            if due <= self._lasting.centre.time:
-                self._lasting.handle(ClockSet(due), time.time_ns())
-            if due > self._lasting.centre.time:
-                self._step(due)
-            else:
-                self._warn_behind(due)
+    def _step_due(self) -> bool:
+        """Make the step that is due; whether one was, so that another may be."""
+        due = self._times.due(self._taken, self._lasting.centre.time)
+        if due is None:
+            return False
+        if skipped := self._times.untold():
+            self._lasting.handle(Skipped(skipped), time.time_ns())
+        if due <= self._lasting.centre.time:
+            self._lasting.handle(ClockSet(due), time.time_ns())
+        if due > self._lasting.centre.time:
+            self._step(due)
+        else:
+            self._warn_behind(due)
+        return True
 
     def _warn_behind(self, due: int) -> None:
         """The clock stands before the last step: none is made until it has caught up, or a new era begins."""
@@ -288,20 +315,37 @@ class Service:
 
     def _publish_status(self) -> Status:
         last = self._result.status if self._result is not None else None
-        centre = self._lasting.centre
-        refused = centre.refusals()
-        self._told.refusals(refused, last.dropped if last is not None else {})
-        status = self._status.make(
-            last,
-            epoch=centre.epoch,
-            inbox=self._inbox,
-            refused=refused,
-            alive=self._tokens.told,
-            skipped=self._times.skipped,
-            overload=None if self._overload.since is None else time.monotonic() - self._overload.since,
-        )
-        status = self._flow.told_in(status)
+        self._refused = self._lasting.centre.refusals()
+        self._told.refusals(self._refused, last.dropped if last is not None else {})
+        status = self._say_status()
         if self._overload.since is not None and status.notes:
             self._told.warn("%s", status.notes[0])
-        self._out["status"].put(encode(status))
         return status
+
+    def _say_status(self, busy: float = 0.0) -> Status:
+        """Publish it. busy: seconds for which the loop has been at one thing, where another thread says it."""
+        with self._saying:
+            since = self._overload.since
+            status = self._status.make(
+                self._result.status if self._result is not None else None,
+                epoch=self._lasting.centre.epoch,
+                inbox=self._inbox,
+                refused=self._refused,
+                alive=self._tokens.told,
+                skipped=self._times.skipped,
+                overload=None if since is None else time.monotonic() - since,
+                busy=busy,
+            )
+            status = self._flow.told_in(status)
+            self._out["status"].put(encode(status))
+            self._heart.beat()
+        return status
+
+    def _say_late(self, busy: float, alive: bool) -> None:
+        """On the heartbeat's thread: the loop is late with the status."""
+        try:
+            status = self._say_status(busy)
+            if alive:
+                notify(f"WATCHDOG=1\nSTATUS={status_line(status)}")
+        except Exception:
+            self._told.error("no status could be published in place of the loop, at one thing for %.0f s", busy)

@@ -18,12 +18,15 @@ __all__ = ["StatusMaker", "status_line"]
 
 SAME_CLOCK = 3600.0
 """Seconds: pictures that are older when they go out are of a mission with a clock of its own."""
+MOST_NAMED = 1000
+"""Sources that a status tells of by name."""
 NAMED = 5
 """Sources that a line names; of more it says the number."""
 
 
 class StatusMaker:
-    """counts: messages, bytes, steps, missed, overtaken, failed_steps, unsaved, behind; whoever sees one counts it."""
+    """counts: messages, bytes, steps, missed, overtaken, failed_steps, failed_turns, unsaved, behind; whoever sees one
+    counts it."""
 
     def __init__(self, name: str) -> None:
         self.counts: Counter[str] = Counter()
@@ -57,16 +60,16 @@ class StatusMaker:
         alive: Mapping[str, bool],
         skipped: int,
         overload: float | None = None,
+        busy: float = 0.0,
     ) -> Status:
         """The status now. last: the centre's own, of its newest step; refused: by reason; alive: whether each source is
-        there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not."""
+        there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not;
+        busy: for which its loop has been at one thing, 0: it says this itself."""
         uptime = time.monotonic() - self._started
         counts, now = self.counts, time.time_ns()
         recent, span = counts - self._before, max(uptime - self._before_at, 1e-3)
         self._before, self._before_at = Counter(counts), uptime
-        sources: dict[str, dict[str, Any]] = dict(last.sources) if last is not None else {}
-        for name, there in alive.items():
-            sources[name] = {**sources.get(name, {}), "alive": there}
+        sources = _bounded(last.sources if last is not None else {}, alive)
         queue = {"waiting": len(inbox), "capacity": inbox.capacity, "high_water": inbox.high_water}
         number, self._number = self._number, self._number + 1
         return Status(
@@ -96,22 +99,38 @@ class StatusMaker:
                 "unsaved": float(counts["unsaved"]),
                 "skipped": float(skipped),
                 "behind": float(counts["behind"]),
+                **({"failed_turns": float(counts["failed_turns"])} if counts["failed_turns"] else {}),
+                **({"busy": busy} if busy else {}),
                 **({"latency": self._latency} if self._latency is not None else {}),
                 **({"overload": overload} if overload is not None else {}),
             },
             road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            notes=self._notes(last, skipped, overload),
+            notes=self._notes(last, skipped, overload, busy),
         )
 
-    def _notes(self, last: Status | None, skipped: int, overload: float | None) -> tuple[str, ...] | None:
+    def _notes(self, last: Status | None, skipped: int, overload: float | None, busy: float) -> tuple[str, ...] | None:
         """The centre's notes, after what the process has to say."""
         said = last.notes if last is not None else None
+        if busy:
+            said = (f"the service has been at one step, or at reading what came, for {busy:.1f} s", *(said or ()))
         if overload is None:
             return said
         behind = "" if self._latency is None else f", and the picture is {self._latency:.2f} s old when it goes out"
         counts = f"{skipped} steps skipped and {self.counts['overtaken']} scans overtaken by newer ones since the start"
         return (f"overload for {overload:.0f} s: more comes than can be worked off; {counts}{behind}", *(said or ()))
+
+
+def _bounded(said: Mapping[str, dict[str, Any]], alive: Mapping[str, bool]) -> dict[str, dict[str, Any]]:
+    """What is said of the sources, with whether each is there: of `MOST_NAMED` by name, of how many more under "*"."""
+    sources = {name: said[name] for name in list(said)[:MOST_NAMED]}
+    beyond = len(said) - len(sources)
+    for name, there in list(alive.items()):
+        if name in sources or len(sources) < MOST_NAMED:
+            sources[name] = {**sources.get(name, {}), "alive": there}
+        else:
+            beyond += name not in said
+    return {**sources, "*": {"more": beyond}} if beyond else sources
 
 
 def status_line(status: Status) -> str:

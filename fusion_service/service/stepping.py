@@ -19,18 +19,24 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre import Centre, ClockSet, Event, Order, StepResult, make_centre
+from fusion_service.centre import Centre, ClockSet, Event, Order, Refused, StepResult, make_centre, source_of
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
-from schemas import encode, messages
+from schemas import Message, encode, messages
 
 __all__ = ["SAVED_EVERY", "LastingCentre", "Made"]
 
 NONE: NDArray[np.uint64] = np.zeros(0, dtype=np.uint64)
 SAVED_EVERY = 1.0
 """Seconds between checkpoints of steps that change no id."""
+
+MOST_SINCE = 20_000
+"""Messages of one step among which one that makes it fail is looked for."""
+MOST_FAULTY = 1000
+"""Messages that made a step fail, which are known again when they come again."""
 
 log = logging.getLogger(__name__)
 
@@ -70,6 +76,8 @@ class LastingCentre:
         self._saved_at = float("-inf")
         self._checkpoint = state.load()
         self._ended = [state.ended()]
+        self._since: list[tuple[Event, int]] = []
+        self._faulty: dict[tuple[str, str, int, int], None] = {}
         self._generation = state.new_generation()
         self.centre = self._make_centre()
         desk.follow(self.centre)
@@ -89,6 +97,11 @@ class LastingCentre:
         """Queue it for the next step. An order is given again should the centre begin anew before that."""
         if isinstance(event, Order):
             self._desk.given(event)
+        elif isinstance(event, Message):
+            if (name := _name_of(event)) in self._faulty:
+                event = Refused(name[0], "failed", 1)
+            elif len(self._since) <= MOST_SINCE:
+                self._since.append((event, received))
         self.centre.handle(event, received)
 
     def step(self, at: int) -> Made | None:
@@ -101,6 +114,8 @@ class LastingCentre:
             if again is None:
                 return None
             made = again
+        finally:  # what waits for a later step may make that one fail
+            self._since = [one for one in self._since if getattr(one[0], "time", -1) > at]
         self._desk.follow(self.centre)
         return made
 
@@ -141,12 +156,16 @@ class LastingCentre:
             self._told.error("cannot note what has ended: %s", error)
 
     def _recover(self, at: int) -> Made | None:
-        """A step failed, by a fault of ours: drop what came in since the last one, and make it from the last
-        checkpoint; if that fails too, begin with nothing."""
+        """A step failed, by a fault of ours: make it from the last checkpoint, with what came in since the last one
+        but the messages without which it does not fail; if it fails with none, begin with nothing."""
         self._counts["failed_steps"] += 1
-        self._told.error("the step at %d failed: what came in for it is dropped", at)
+        self._told.error("the step at %d failed", at)
+        left, faulty = self._sorted_out(at)
         self._restart()
-        self.centre.handle(ClockSet(at), time.time_ns())
+        for event, received in [(ClockSet(at), time.time_ns()), *left]:
+            self.centre.handle(event, received)
+        for name, count in Counter(source_of(event) for event, _ in faulty).items():
+            self.centre.handle(Refused(name, "failed", count), time.time_ns())
         try:
             return self._make(at)
         except Exception:
@@ -154,6 +173,41 @@ class LastingCentre:
             self._checkpoint = None
             self._restart()
             return None
+
+    def _sorted_out(self, at: int) -> tuple[list[tuple[Event, int]], list[tuple[Message, int]]]:
+        """What came in for the step at `at`, without the messages that make it fail, and these; all are dropped where
+        they are not found."""
+        since = [(event, received) for event, received in self._since if isinstance(event, Message)]
+        if len(since) > MOST_SINCE:
+            self._told.error("the step at %d had too many messages to try: all that came in for it is dropped", at)
+            return [], []
+        try:
+            places = set(culprits([(source_of(one[0]), one) for one in since], lambda some: self._fails(at, some)))
+        except TooManyTries:
+            self._told.error("what made the step at %d fail is not found: all that came in for it is dropped", at)
+            return [], since
+        faulty = [since[place] for place in sorted(places)]
+        for event, _ in faulty:
+            name = _name_of(event)
+            self._told.error("it failed for the message %d of %s (%s), which is refused", event.seq, *name[:2])
+            self._faulty[name] = None
+            if len(self._faulty) > MOST_FAULTY:
+                del self._faulty[next(iter(self._faulty))]
+        return [one for place, one in enumerate(since) if place not in places], faulty
+
+    def _fails(self, at: int, some: list[tuple[Message, int]]) -> bool:
+        """Whether the step at `at` fails with these messages, tried by a centre of the last checkpoint."""
+        try:
+            centre, _ = make_centre(self._config, self._checkpoint, generation=self._generation)
+            for event, received in [(ClockSet(at), time.time_ns()), *some]:
+                centre.handle(event, received)
+            result = centre.step(at)
+            encode(result.tracks)
+            encode(result.log)
+            centre.checkpoint()
+        except Exception:
+            return True
+        return False
 
     def _restart(self) -> None:
         try:
@@ -172,6 +226,11 @@ def _settles(result: StepResult) -> bool:
     picture, log = result.tracks, result.log
     merged = any(heir is not None for _, _, heir in picture.ended)
     return bool(merged or picture.split_from or log.events or (log.decisions.kind == messages.CONFIRMED_NOW).any())
+
+
+def _name_of(message: Message) -> tuple[str, str, int, int]:
+    """What tells a message apart: source, kind, run and number."""
+    return source_of(message), message.type, message.epoch, message.seq
 
 
 def without(config: CentreConfig, checkpoint: bytes, ended: NDArray[np.uint64]) -> bytes:

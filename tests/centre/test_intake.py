@@ -213,7 +213,7 @@ def test_partial_scans_of_many_tracks_are_taken_together_and_as_one_by_one() -> 
 def test_a_table_full_of_tracks_takes_its_own_updates_and_refuses_more(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(1)
     count = 5000
-    monkeypatch.setattr("fusion_service.centre.intake.MAX_TRACKS", count)
+    monkeypatch.setattr("fusion_service.centre.limits.MAX_TRACKS", count)
     means = np.concatenate([rng.uniform(-1e7, 1e7, (count, 2)), np.zeros((count, 2))], axis=1)
     made = centre(("r1",))
     give(made, tracks("r1", 1, means))

@@ -146,6 +146,7 @@ def test_a_service_that_is_behind_says_so_loses_and_doubles_nothing_and_recovers
     before, first = scene.seen.confirmed(), len(scene.seen.pictures)
     slow.touch()
     eventually(lambda: "overload" in scene.last_status().step_time and scene.last_status().queue["overtaken"] >= 4, 8)
+    eventually(lambda: scene.last_status().dropped, 4)  # told by the next step
     status = scene.last_status()
     assert status.step_time["skipped"] > 0
     assert status.step_time["latency"] > 0.5
