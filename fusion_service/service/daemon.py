@@ -103,7 +103,7 @@ class Service:
         self._counts = self._status.counts
         self._told = BoundedLog(config.service.log_refusals)
         self._tokens = Tokens(self._inbox.wake)
-        self._desk = OrderDesk(lambda order: self._inbox.put("", order))
+        self._desk = OrderDesk(lambda order: self._inbox.put("", order), secured=config.bus.security is not None)
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
         self._times = StepTimes(config.centre, authenticated=config.bus.security is not None)
         self._flow = Flow(config.limits)
@@ -138,6 +138,7 @@ class Service:
                     stop.wait(0.1)
         notify("STOPPING=1")
         self._lasting.save(at_once=True)
+        self._desk.promises.close()
         self._publish_status()
         log.info("stopped after %d steps", self._counts["steps"])
 
@@ -174,8 +175,11 @@ class Service:
             bus.watch(global_key(centre, "alive", realm), self._tokens.note)
             bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
-        bus.answer(global_key(name, "orders", realm), self._desk.answer)
-        bus.answer_each(order_key(name, "*", realm), lambda key, asked: self._desk.answer(asked, key.rsplit("/", 1)[1]))
+        answer = self._desk.answer
+        bus.answer_later(global_key(name, "orders", realm), lambda _, asked, reply: answer(asked, reply))
+        bus.answer_later(
+            order_key(name, "*", realm), lambda key, asked, reply: answer(asked, reply, key.rsplit("/", 1)[1])
+        )
         bus.announce(global_key(name, "alive", realm))
 
     def _wake_at(self, stop: threading.Event) -> None:
@@ -202,7 +206,7 @@ class Service:
 
     def _take(self, timeout: float) -> list[Arrival | Order]:
         """What has come; where the service is behind, of each source the newest complete scan only."""
-        items = self._inbox.take(timeout)
+        items = self._inbox.take(min(timeout, self._desk.promises.wait()))
         self._taken = time.time_ns()
         oldest = next((item.received for _, item in items if isinstance(item, Arrival)), self._taken)
         if self._overload.look(time.monotonic(), (self._taken - oldest) / 1e9, self._times.skipped):
@@ -216,7 +220,7 @@ class Service:
         if isinstance(item, Order):
             fault = f": {item.refused}" * bool(item.refused)
             if self._told.allows(f"orders {item.number % 20}", 1.0):  # twenty lines a second: the step log has them all
-                log.info("order %d of %s: %s%s", item.number, item.who or "?", item.what, fault)
+                log.info("order %d of %s: %s%s", item.number, item.giver, item.what, fault)
             self._lasting.handle(item, time.time_ns())
             return
         self._counts["messages"] += 1

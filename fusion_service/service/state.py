@@ -60,6 +60,11 @@ class State:
             self._write("generation", f"{self._last}\n".encode(), sync=True)
         return self._last
 
+    @property
+    def folder(self) -> Path | None:
+        """Where it is; None: nothing is kept."""
+        return self._folder
+
     def load(self) -> bytes | None:
         """The last checkpoint, if there is one."""
         if self._folder is None or not (self._folder / "checkpoint").exists():
