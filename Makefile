@@ -2,7 +2,6 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-export PIP_CONSTRAINT := $(CURDIR)/constraints.txt
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: demo test slow-test lint format docs wheel-test python-test bench studies clean
@@ -27,7 +26,7 @@ format: $(VENV)/ready
 	$(BIN)/ruff check -q --fix .
 	$(BIN)/ruff format -q .
 
-docs: $(VENV)/docs-ready
+docs: $(VENV)/ready
 	$(BIN)/python docs/site/build.py
 	@echo "site/html/index.html"
 
@@ -48,12 +47,9 @@ $(VENV)/ready: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python 3.11 or newer is needed: make PYTHON=python3.12" >&2; exit 1; }
 	@echo "Setting up $(VENV) (once, about a minute) ..."
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install -q -e '.[record,report,dev,fast,keys]'
+	$(BIN)/pip install -q --require-hashes -r constraints.txt
+	$(BIN)/pip install -q --no-deps --no-build-isolation -e .
 	$(BIN)/python -m fusion_service.compiled
-	touch $@
-
-$(VENV)/docs-ready: $(VENV)/ready
-	$(BIN)/pip install -q -e '.[docs]'
 	touch $@
 
 clean:

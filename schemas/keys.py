@@ -1,8 +1,9 @@
 """Key expressions: build and parse.
 
 {realm}/v1/local/{source}/tracks|intensity|info|alive
-{realm}/v1/global/{centre}/tracks|log|status|alive|picture|orders
+{realm}/v1/global/{centre}/tracks|log|status|alive|picture|orders|state
 {realm}/v1/global/{centre}/orders/{operator}
+{realm}/v1/global/{centre}/holds|yields|standby/{name}
 {realm}/v1/truth/{scenario}
 """
 
@@ -22,6 +23,7 @@ __all__ = [
     "local_key",
     "order_key",
     "parse_key",
+    "token_key",
     "truth_key",
 ]
 
@@ -29,7 +31,8 @@ REALM = "fusion"
 VERSION = "v1"
 LOCAL = ("tracks", "intensity", "info", "alive")
 CENTRES = "global/"
-GLOBAL = ("tracks", "log", "status", "alive", "picture", "orders")
+GLOBAL = ("tracks", "log", "status", "alive", "picture", "orders", "state")
+TOKENS = ("holds", "yields", "standby")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}\Z")
 
 
@@ -86,11 +89,20 @@ def local_key(source: str, what: str, realm: str = REALM) -> str:
 
 
 def global_key(centre: str, what: str, realm: str = REALM) -> str:
-    """Key of a centre; `what` is tracks, log, status, alive, picture or orders. `*` stands for any centre.
+    """Key of a centre; `what` is tracks, log, status, alive, picture, orders or state. `*` stands for any centre.
     Raises ValueError for any other, and for what is no name or realm."""
     if what not in GLOBAL:
         raise ValueError(f"no global key {what!r} (known: {' '.join(GLOBAL)})")
     return f"{check_realm(realm)}/{VERSION}/global/{centre if centre == '*' else check_name(centre)}/{what}"
+
+
+def token_key(centre: str, what: str, name: str, realm: str = REALM) -> str:
+    """Key of a liveliness token by which the processes of one centre know of each other; `what` is holds, yields or
+    standby. `*` stands for any name. Raises ValueError for any other, and for what is no name or realm."""
+    if what not in TOKENS:
+        raise ValueError(f"no token {what!r} (known: {' '.join(TOKENS)})")
+    name = name if name == "*" else check_name(name)
+    return f"{check_realm(realm)}/{VERSION}/global/{check_name(centre)}/{what}/{name}"
 
 
 def order_key(centre: str, operator: str, realm: str = REALM) -> str:

@@ -291,7 +291,9 @@ class StepLog(Header):
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Status(Header):
     """Health of a centre. Counters grow since its start; `sources` maps a name to its own small map;
-    `notes` are sentences about the centre that an operator should read; `road`: what small matrices are computed by."""
+    `notes` are sentences about the centre that an operator should read; `road`: what small matrices are computed by;
+    `term`: the term under which the process holds the centre's name, and `standby`: of those that stand by for it, how
+    many are `there`, and `ready` to take over."""
 
     type: ClassVar[str] = "status"
     time: int
@@ -307,6 +309,8 @@ class Status(Header):
     memory: int | None = None
     notes: tuple[str, ...] | None = None
     road: str | None = None
+    term: int | None = None
+    standby: dict[str, int] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -202,6 +202,8 @@ FIELDS: dict[type[Message], tuple[Field, ...]] = {
         _plain("memory", values.u64, optional=True),
         _plain("notes", values.list_of(values.text), list, optional=True),
         _plain("road", values.text, optional=True),
+        _plain("term", values.u64, optional=True),
+        _plain("standby", _COUNTERS, optional=True),
     ),
     Truth: (
         *_HEADER,

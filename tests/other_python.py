@@ -56,7 +56,11 @@ def tested(version: str, python: str) -> str:
             ".",
             *NEEDED,
         ]
-        constraint = {"PIP_CONSTRAINT": str(ROOT / "constraints.txt")}
+        pins = [
+            line.split(" ")[0] for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines() if "==" in line
+        ]
+        (here / "versions.txt").write_text("\n".join(pins), "utf-8")  # with hashes pip would want one of the package
+        constraint = {"PIP_CONSTRAINT": str(here / "versions.txt")}
         done = subprocess.run(
             install, cwd=ROOT, capture_output=True, text=True, check=False, env=os.environ | constraint
         )

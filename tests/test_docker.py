@@ -148,7 +148,9 @@ def test_the_image_gets_what_the_wheel_needs_and_no_more() -> None:
     project = PROJECT["project"]
     needed = {"pyproject.toml", project["readme"], *project["license-files"]}
     needed |= set(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])
-    assert copied() == needed | {"constraints.txt", "docker/health.py"}
+    assert copied() == needed | {
+        f"docker/{name}" for name in ("build.txt", "health.py", "requirements.txt", "sbom.json")
+    }
     assert all((ROOT / source).exists() for source in copied())
     lines = (ROOT / ".dockerignore").read_text().splitlines()[1:]
     assert lines == ["*", *(line for line in lines if line.startswith("!")), "**/__pycache__"]

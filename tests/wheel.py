@@ -49,9 +49,13 @@ def run(*command: str | Path, code: int = 0, folder: Path) -> str:
 
 
 def main() -> None:
-    os.environ["PIP_CONSTRAINT"] = str(ROOT / "constraints.txt")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        pins = [
+            line.split(" ")[0] for line in (ROOT / "constraints.txt").read_text("utf-8").splitlines() if "==" in line
+        ]
+        (folder / "versions.txt").write_text("\n".join(pins), "utf-8")  # with hashes pip would want one of the wheel
+        os.environ["PIP_CONSTRAINT"] = str(folder / "versions.txt")
         run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT, folder=folder)
         (wheel,) = folder.glob("*.whl")
         names = set(zipfile.ZipFile(wheel).namelist())

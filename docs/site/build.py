@@ -32,6 +32,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "standby",
             "security",
             "arrival",
             "judgement",

@@ -8,7 +8,7 @@ token. Who reads may subscribe, look for tokens, and ask publishers for samples 
 | role | owns | reads |
 |---|---|---|
 | source | `local/{name}/**` | nothing |
-| centre | `global/{name}/**`, the queryables `picture` and `orders` | `local/**`, `global/**` |
+| centre | `global/{name}/**`, queryables `picture`, `orders`, `state` | `local/**`, `global/**`, its own `state` |
 | recorder | nothing | everything but questions and answers |
 | viewer | nothing | `global/**`; asks for `picture` |
 | operator | nothing | as a viewer; gives orders on `global/*/orders/{name}` alone |
@@ -84,7 +84,12 @@ def rights(party: Party) -> Rights:
     picture = "global/*/picture"
     return {
         "source": Rights(own=(f"local/{name}/**",)),
-        "centre": Rights(own=(f"global/{name}/**",), read=("local/**", "global/**"), ask=(picture,), asked=(picture,)),
+        "centre": Rights(
+            own=(f"global/{name}/**",),
+            read=("local/**", "global/**"),
+            ask=(picture, f"global/{name}/state"),
+            asked=(picture,),
+        ),
         "recorder": Rights(read=("**",)),
         "viewer": Rights(read=("global/**",), ask=(picture,)),
         "operator": Rights(read=("global/**",), ask=(picture, f"global/*/orders/{name}")),

@@ -211,6 +211,16 @@ class Bus:
             entity = self._session.liveliness().declare_subscriber(key_expression, guard.wrap(change), history=True)
         return Declaration(self, [entity], guard)
 
+    def present(self, key_expression: str, timeout: float = 1.0) -> tuple[list[str], bool]:
+        """The tokens there are now, and whether the hub was there to say so. Waits for it up to `timeout` seconds: not
+        for use in a callback, nor on a session that watches such keys, which asks nobody but answers from what it has
+        heard."""
+        there = self.connected
+        with _readable(key_expression):
+            replies = list(self._session.liveliness().get(key_expression, timeout=timeout))
+        keys = {str(reply.ok.key_expr): None for reply in replies if reply.ok}
+        return list(keys), there and self.connected and all(reply.ok for reply in replies)
+
     def answer(self, key: str, handler: Callable[[bytes | None], bytes]) -> Declaration:
         """Answer every `ask` on `key` with `handler(payload)`. If it raises, who asked is told."""
         return self.answer_each(key, lambda _, payload: handler(payload))

@@ -13,6 +13,10 @@ from schemas import GlobalTracks, LocalIntensity, LocalTracks
 __all__ = ["MessageClock", "WallClock", "horizon"]
 
 
+RESUMED = 10_000_000_000
+"""ns after a step within which another process goes on from it, not from the next period."""
+
+
 def horizon(received: int, config: CentreConfig) -> int:
     """The latest time, ns, that what came at `received` may speak of: everything beyond is refused as `future`."""
     return received + round(config.max_future * 1e9)
@@ -39,6 +43,11 @@ class WallClock:
         self.skipped += max(0, (newest - self._last) // self._period - 1)
         self._last = newest
         return newest
+
+    def resume(self, last: int, now: int) -> None:
+        """Go on at `now` after a step at `last`, ns, if that was within `RESUMED`."""
+        if 0 <= last <= now - self._delay <= last + RESUMED:
+            self._last = last // self._period * self._period
 
     def wait(self, now: int) -> float:
         """Seconds until the next step is due."""

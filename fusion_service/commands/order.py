@@ -18,7 +18,9 @@ EXAMPLE = """fusion-service order list
   fusion-service order identify --track 7 --identity mmsi:257054000
   fusion-service order quarantine --source radar-3
   fusion-service order supervise --source radar-3 --state trusted
-  fusion-service order withdraw 4"""
+  fusion-service order withdraw 4
+  fusion-service order handover                               the one that stands by goes on, for an upgrade"""
+HANDOVER = "handover"
 ANSWER = 10.0
 """Seconds that a centre has for its answer, which comes when a step has obeyed, and the hub to be there."""
 
@@ -30,8 +32,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     from fusion_service.process import argument
 
     words = "\n".join(f"  {word:<12}{meaning}" for word, meaning in WHAT.items())
-    parser.description = f"{HELP}\n\norders:\n  {'list':<12}the orders that stand\n{words}"
-    parser.add_argument("what", choices=("list", *WHAT), metavar="ORDER", help="one of the above")
+    parser.description = (
+        f"{HELP}\n\norders:\n  {'list':<12}the orders that stand\n{words}"
+        f"\n  {HANDOVER:<12}the active process of the centre lets the one that stands by go on"
+    )
+    parser.add_argument("what", choices=("list", *WHAT, HANDOVER), metavar="ORDER", help="one of the above")
     parser.add_argument("withdrawn", nargs="?", type=int, metavar="N", help="withdraw: the number of the order")
     track = "whole id, number that a recording shows, or given number or callsign"
     parser.add_argument("--track", metavar="ID", help=f"the global track: {track}")
@@ -92,6 +97,10 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     answer = msgpack.unpackb(answers[0][1])
     if args.what == "list":
         print(_table(answer["orders"]))
+    elif args.what == HANDOVER and answer["done"]:
+        print(answer["outcome"])
+    elif args.what == HANDOVER:
+        raise OrderError(f"no handover: {answer['outcome']}")
     elif answer["done"]:
         more = ", when a step is made: none is at the moment" if answer.get("pending") else ""
         more += "" if answer.get("kept", True) else " (not on disk: the service keeps no state, or cannot write it)"

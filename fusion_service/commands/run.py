@@ -13,6 +13,7 @@ __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "The fusion service."
 EXAMPLE = """fusion-service run --config centre.toml
+  fusion-service run --config centre.toml --standby           a second one, which takes over when the first is gone
   fusion-service run --config centre.toml --security keys/centre-centre"""
 
 
@@ -25,6 +26,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         type=argument(check_endpoint),
         metavar="ENDPOINT",
         help="hub to join, instead of the config's",
+    )
+    parser.add_argument(
+        "--standby",
+        action="store_true",
+        help="follow the centre of this name that runs, and take over when it is gone (same config, own state folder)",
     )
     parser.add_argument("--hub", action="store_true", help="hold a hub in this process too (the smallest installation)")
     parser.add_argument("--security", metavar="FILE", help="certificates, instead of the config's (see `keys`)")
@@ -48,6 +54,6 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, security=args.security))
     if args.hub:
         with open_hub(config.bus.connect, hub_security(config.bus.security)):
-            run_service(config, stop)
+            run_service(config, stop, args.standby)
     else:
-        run_service(config, stop)
+        run_service(config, stop, args.standby)

@@ -12,6 +12,9 @@ import logging
 import threading
 import time
 from collections import Counter
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 from fusion_service.bus import Bus, Inbox, open_bus
@@ -35,9 +38,12 @@ from fusion_service.service.heartbeat import Heartbeat
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.overload import Overload, overtaken
+from fusion_service.service.promises import Reply
 from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker, status_line
 from fusion_service.service.stepping import LastingCentre
+from fusion_service.service.succession import succeed
+from fusion_service.service.tenure import Tenure
 from fusion_service.service.timing import StepTimes
 from fusion_service.service.tokens import Tokens
 from fusion_service.source_words import source_event
@@ -76,9 +82,9 @@ class Arrival(NamedTuple):
     received: int
 
 
-def run_service(config: ServiceConfig, stop: threading.Event) -> None:
-    """Run until `stop` is set. Raises `BusError`, `SecurityError`, `StateError` or `ConfigError`, which says in one
-    line why it cannot start."""
+def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = False) -> None:
+    """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `SecurityError`, `StateError`
+    or `ConfigError`, which says in one line why it cannot start."""
     try:
         begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
@@ -86,16 +92,18 @@ def run_service(config: ServiceConfig, stop: threading.Event) -> None:
     security = maybe_security(config.bus.security)
     if security is not None:
         check_party(security, ("centre",), config.centre.name)
-    with open_state(config.service.state) as state, open_bus(config.bus.connect, stop=stop, security=security) as bus:
-        Service(config, bus, state).run(stop)
+    with open_state(config.service.state) as state:
+        join = partial(open_bus, config.bus.connect, stop=stop, security=security)
+        succeed(config, state, stop, join, Service, standby)
 
 
 class Service:
-    """The service on an open bus, with its state."""
+    """The service on an open bus, with its state; tenure: its hold of the centre's name."""
 
-    def __init__(self, config: ServiceConfig, bus: Bus, state: State) -> None:
+    def __init__(self, config: ServiceConfig, bus: Bus, state: State, tenure: Tenure | None = None) -> None:
         self._config = config
         self._bus = bus
+        self._tenure = tenure or Tenure(config, bus)
         self._inbox: Inbox[Arrival | Order] = Inbox(
             config.bus.queue, slot_bytes=max(1, MOST_WAITING // config.bus.queue)
         )
@@ -105,6 +113,7 @@ class Service:
         self._tokens = Tokens(self._inbox.wake)
         self._desk = OrderDesk(lambda order: self._inbox.put("", order), secured=config.bus.security is not None)
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
+        self._desk.promises.may = self._tenure.may_publish
         self._times = StepTimes(config.centre, authenticated=config.bus.security is not None)
         self._flow = Flow(config.limits)
         self._overload = Overload(self._times.patience)
@@ -118,9 +127,17 @@ class Service:
         self._saying = threading.Lock()
         self._heart = Heartbeat(config.service.status_period, self._say_late)
 
-    def run(self, stop: threading.Event) -> None:
-        """Work until `stop` is set."""
+    def feed(self, source: str, key: str, data: bytes, received: int) -> None:
+        """Take a sample as if it came now: of one that stood by."""
+        self._inbox.put(source, Arrival(key, data, received), len(data))
+
+    def run(self, stop: threading.Event, begun: Callable[[], None] | None = None) -> None:
+        """Work until `stop` is set, or another holds the centre's name. begun: called when all is declared."""
+        self._tenure.begin(self._lasting.generation, self._lasting.centre.epoch, self._inbox.wake)
         self._declare()
+        if begun is not None:
+            begun()
+            self._times.resume(self._lasting.centre.time, time.time_ns())
         threading.Thread(target=self._wake_at, args=(stop,), daemon=True).start()
         notify("READY=1")
         centre = self._config.centre
@@ -129,16 +146,19 @@ class Service:
         gc.collect()
         gc.freeze()  # what is loaded stays: it is not looked through again in the middle of a step
         with self._heart:
-            while not stop.is_set():
+            while self._tenure.goes_on(self._lasting.centre, stop) and not stop.is_set():
                 try:
                     self._turn(stop)
                 except Exception:  # a fault of ours: the next turn may be better
                     self._counts["failed_turns"] += 1
                     self._told.error("the loop failed %d times", self._counts["failed_turns"])
                     stop.wait(0.1)
-        notify("STOPPING=1")
         self._lasting.save(at_once=True)
         self._desk.promises.close()
+        if not stop.is_set():
+            log.warning("stands down: %s", self._tenure.farewell)
+            return
+        notify("STOPPING=1")
         self._publish_status()
         log.info("stopped after %d steps", self._counts["steps"])
 
@@ -146,7 +166,8 @@ class Service:
         """Take what has come, make a step if one is due, and say how it goes. At most one step between two readings of
         the inbox."""
         self._heart.turned()
-        wait = 0.0 if self._stepped else max(0.0, min(self._status_due - time.monotonic(), self._wait()))
+        due = min(self._status_due - time.monotonic(), self._wait(), self._tenure.pace)
+        wait = 0.0 if self._stepped else max(0.0, due)
         for item in self._take(wait):
             if stop.is_set():
                 break
@@ -175,10 +196,9 @@ class Service:
             bus.watch(global_key(centre, "alive", realm), self._tokens.note)
             bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
-        answer = self._desk.answer
-        bus.answer_later(global_key(name, "orders", realm), lambda _, asked, reply: answer(asked, reply))
+        bus.answer_later(global_key(name, "orders", realm), lambda _, asked, reply: self._on_order(asked, reply))
         bus.answer_later(
-            order_key(name, "*", realm), lambda key, asked, reply: answer(asked, reply, key.rsplit("/", 1)[1])
+            order_key(name, "*", realm), lambda key, asked, reply: self._on_order(asked, reply, key.rsplit("/", 1)[1])
         )
         bus.announce(global_key(name, "alive", realm))
 
@@ -196,6 +216,13 @@ class Service:
 
     def _on_miss(self, key: str, count: int) -> None:
         self._counts["missed"] += count
+
+    def _on_order(self, payload: bytes | None, reply: Reply, operator: str = "") -> None:
+        may = bool(operator) or self._config.bus.security is None
+        if may and (answer := self._tenure.ordered(payload, operator)) is not None:
+            reply(answer)
+        else:
+            self._desk.answer(payload, reply, operator)
 
     def _on_picture(self, payload: bytes | None) -> bytes:
         if self._result is None:
@@ -295,7 +322,8 @@ class Service:
         if made is None:
             return
         for what, payload in made.messages.items():
-            self._out[what].put(payload)
+            self._put(what, payload)
+        self._tenure.stepped(made.result.log.step, at, self._lasting.centre.epoch, self._lasting.generation)
         self._status.published(at, time.time_ns())
         notes = made.result.status.notes
         if notes and self._told.allows(notes[0], 600.0):
@@ -304,6 +332,11 @@ class Service:
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
+
+    def _put(self, what: str, payload: bytes) -> None:
+        """Publish it, if this process is still the one that does."""
+        if self._tenure.may_publish():
+            self._out[what].put(payload)
 
     def _tell_sources(self, journal: StepLog) -> None:
         """Say what has changed about sources: how they are trusted, shifted, used: twenty lines a second at most."""
@@ -339,9 +372,11 @@ class Service:
                 skipped=self._times.skipped,
                 overload=None if since is None else time.monotonic() - since,
                 busy=busy,
+                more=self._tenure.notes(),
             )
             status = self._flow.told_in(status)
-            self._out["status"].put(encode(status))
+            status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
+            self._put("status", encode(status))
             self._heart.beat()
         return status
 

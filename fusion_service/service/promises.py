@@ -43,6 +43,8 @@ class Promises:
     """All methods may be called from any thread. clock: seconds that only grow."""
 
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        self.may: Callable[[], bool] = lambda: True
+        """Whether this process' steps are the centre's."""
         self._clock = clock
         self._lock = threading.Lock()
         self._open: dict[int, _Promise] = {}
@@ -69,7 +71,9 @@ class Promises:
         """A step has obeyed, or refused, the orders of these events of its log; kept: its checkpoint is on disk."""
         for event in events:
             promise = self._pop(event.get("number"))
-            if promise is not None:
+            if promise is not None and not self.may():
+                promise.reply(ValueError("another process holds the centre's name now: give the order again"))
+            elif promise is not None:
                 promise.answer(bool(event.get("done")), str(event.get("outcome", "")), kept)
 
     def lose(self, orders: Iterable[Order]) -> None:

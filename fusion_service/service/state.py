@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.errors import FusionError
+from fusion_service.service.terms import NODES, generation_after
 
 __all__ = ["State", "StateError", "open_state"]
 
@@ -42,6 +43,35 @@ class State:
         self._folder = folder
         self._synced = 0.0
         self._last = 0
+        self._heritage: tuple[bytes | None, NDArray[np.uint64]] | None = None
+        self.node = self._kept_node() or 0
+        """This process' own among those that give ids under one centre's name (see `terms`)."""
+        self.epoch_above = 0
+        """Runs of the centre begin after this, ns."""
+
+    def _kept_node(self) -> int | None:
+        try:
+            return int((self._folder / "node").read_text()) % NODES if self._folder is not None else None
+        except (OSError, ValueError):
+            return None
+
+    @property
+    def has_node(self) -> bool:
+        """Whether it was settled once, beside another process."""
+        return self._kept_node() is not None
+
+    def keep_node(self, node: int) -> None:
+        """From now on this process gives ids as `node`, over restarts too."""
+        self.node = node
+        if self._folder is not None:
+            self._write("node", f"{node}\n".encode(), sync=True)
+
+    def inherit(self, checkpoint: bytes | None, ended: NDArray[np.uint64], generation: int, epoch: int) -> None:
+        """A service begins next that goes on where another one was: with this checkpoint instead of the own, without
+        the tracks that have `ended` since, and above that one's generation and epoch."""
+        if checkpoint is not None:
+            self._heritage = checkpoint, ended
+        self._last, self.epoch_above = max(self._last, generation), max(self.epoch_above, epoch)
 
     def new_generation(self) -> int:
         """A generation that was never taken before, on disk when this returns. Raises `StateError` or
@@ -53,7 +83,7 @@ class State:
                 last = int(path.read_text()) if path.exists() else 0
             except ValueError:
                 raise StateError(f"{path} does not hold a number: delete it to go on with the clock's") from None
-        self._last = max(last + 1, _by_clock())
+        self._last = generation_after(max(last, self._last), self.node, _by_clock())
         if self._folder is not None:
             if not self._last < 2**32:
                 raise StateError(f"{self._folder / 'generation'} is used up: delete it to go on with the clock's")
@@ -66,7 +96,9 @@ class State:
         return self._folder
 
     def load(self) -> bytes | None:
-        """The last checkpoint, if there is one."""
+        """The last checkpoint, or the one inherited, if there is one."""
+        if self._heritage is not None:
+            return self._heritage[0]
         if self._folder is None or not (self._folder / "checkpoint").exists():
             return None
         return (self._folder / "checkpoint").read_bytes()
@@ -89,6 +121,9 @@ class State:
 
     def ended(self) -> NDArray[np.uint64]:
         """The ids that have ended since the last checkpoint was made."""
+        if self._heritage is not None:
+            (_, ended), self._heritage = self._heritage, None
+            return ended
         if self._folder is None or not (self._folder / "ended").exists():
             return np.zeros(0, dtype=np.uint64)
         data = (self._folder / "ended").read_bytes()

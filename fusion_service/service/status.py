@@ -61,10 +61,11 @@ class StatusMaker:
         skipped: int,
         overload: float | None = None,
         busy: float = 0.0,
+        more: tuple[str, ...] = (),
     ) -> Status:
         """The status now. last: the centre's own, of its newest step; refused: by reason; alive: whether each source is
         there; skipped: steps that were not made; overload: seconds for which the service is behind, None: it is not;
-        busy: for which its loop has been at one thing, 0: it says this itself."""
+        busy: for which its loop has been at one thing, 0: it says this itself; more: notes."""
         uptime = time.monotonic() - self._started
         counts, now = self.counts, time.time_ns()
         recent, span = counts - self._before, max(uptime - self._before_at, 1e-3)
@@ -106,12 +107,14 @@ class StatusMaker:
             },
             road=road(),
             memory=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024,
-            notes=self._notes(last, skipped, overload, busy),
+            notes=self._notes(last, skipped, overload, busy, more),
         )
 
-    def _notes(self, last: Status | None, skipped: int, overload: float | None, busy: float) -> tuple[str, ...] | None:
-        """The centre's notes, after what the process has to say."""
-        said = last.notes if last is not None else None
+    def _notes(
+        self, last: Status | None, skipped: int, overload: float | None, busy: float, more: tuple[str, ...]
+    ) -> tuple[str, ...] | None:
+        """The centre's notes, after what the process has to say, and `more`."""
+        said = (*more, *((last.notes if last is not None else None) or ())) or None
         if busy:
             said = (f"the service has been at one step, or at reading what came, for {busy:.1f} s", *(said or ()))
         if overload is None:

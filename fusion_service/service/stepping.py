@@ -88,7 +88,7 @@ class LastingCentre:
             self.handle(order, time.time_ns())
 
     def _make_centre(self) -> Centre:
-        epoch = time.time_ns()
+        epoch = max(time.time_ns(), self._state.epoch_above + 1)
         if self._checkpoint is not None:
             self._checkpoint, self._ended = without(self._config, self._checkpoint, np.concatenate(self._ended)), [NONE]
         centre, fault = make_centre(self._config, self._checkpoint, generation=self._generation, epoch=epoch)
@@ -151,6 +151,11 @@ class LastingCentre:
                 kept = False
                 self._told.error("cannot keep what was ordered: %s", error)
             self._desk.promises.hold(overdue, kept)
+
+    @property
+    def generation(self) -> int:
+        """The upper half of the ids that are given now."""
+        return self._generation
 
     def save(self, *, at_once: bool = False) -> None:
         """Save what has changed, where that is due, and orders that wait for a step."""

@@ -74,6 +74,10 @@ class StepTimes:
             self._passed += 1
         return due
 
+    def resume(self, last: int, now: int) -> None:
+        """Go on at `now` after a step at `last`, ns, that another process made, without waiting for the next period."""
+        self._wall.resume(last, now)
+
     def wait(self, now: int) -> float:
         """Seconds until a step may be due without anything new; infinite where none will be."""
         if self._arrival is not None:

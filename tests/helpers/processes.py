@@ -90,6 +90,12 @@ class Program:
         self._process.stdin.write(f"{line}\n".encode())
         self._process.stdin.flush()
 
+    def told(self) -> str:
+        """Kill it, and what it wrote to stderr."""
+        self.kill()
+        assert self._process.stderr is not None
+        return self._process.stderr.read().decode()
+
     def end(self, timeout: float = 10.0) -> tuple[int, str]:
         """Wait for it to end by itself: (exit code, what it wrote to stderr)."""
         _, errors = self._process.communicate(timeout=timeout)

@@ -13,7 +13,7 @@ import schemas
 NAMES = st.from_regex(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}", fullmatch=True)
 REALMS = st.lists(NAMES.filter(lambda name: name != "v1"), min_size=1, max_size=3).map("/".join)
 LOCAL = ("tracks", "intensity", "info", "alive")
-GLOBAL = ("tracks", "log", "status", "alive", "picture", "orders")
+GLOBAL = ("tracks", "log", "status", "alive", "picture", "orders", "state")
 HOSTILE = (
     "",
     " ",

@@ -31,7 +31,8 @@ class Seconds:
 
 def flow(**limits: float) -> tuple[Flow, Seconds]:
     clock = Seconds()
-    return Flow(LimitsConfig(**{"messages": 0.0, "bytes": 0.0, "tracks": 0.0, **limits}), clock), clock
+    none = LimitsConfig(messages=0.0, bytes=0.0, tracks=0.0)
+    return Flow(replace(none, **limits), clock), clock
 
 
 @pytest.mark.parametrize(

@@ -7,10 +7,10 @@ from collections import Counter
 from dataclasses import replace
 
 from fusion_service.centre import ArrivalClock, MessageClock, Refused, source_of
+from fusion_service.centre.inputs import LocalMessage
 from fusion_service.config import CentreConfig
 from fusion_service.recording.steps import Step
 from fusion_service.review.replay.engine import OnStep
-from fusion_service.review.replay.inputs import LocalMessage
 from fusion_service.review.replay.player import Player
 from schemas import GlobalTracks, SensorInfo, StepLog
 

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 from fusion_service.centre import StepResult
+from fusion_service.centre.inputs import LocalMessage
 from fusion_service.recording.steps import Step
-from fusion_service.review.replay.inputs import LocalMessage
 from fusion_service.review.replay.player import Player
 from fusion_service.review.replay.verifying import Difference
 from schemas import GlobalTracks, StepLog

@@ -13,11 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from fusion_service.centre import Event, NewEra, Refused, Skipped, SourceFound, SourceLost, order_of
+from fusion_service.centre import Event
+from fusion_service.centre.inputs import Input, InputBuffer, LocalMessage
+from fusion_service.centre.retracing import events_of
 from fusion_service.config import config_hash
 from fusion_service.recording.steps import PATIENCE, Step, Steps
 from fusion_service.review.replay.engine import OnStep
-from fusion_service.review.replay.inputs import Input, InputBuffer, LocalMessage
 from fusion_service.review.replay.mission_settings import RunSettings
 from fusion_service.review.replay.player import Player
 from fusion_service.review.replay.verifying import Difference
@@ -122,7 +123,7 @@ class LogEngine:
         events: list[Event] = []
         if log is not None:
             inputs += self._named(step, log)
-            events = _events(log)
+            events = events_of(log)
         if self.apart:
             self._note_apart(step.number)
         for player in self._players:
@@ -194,19 +195,3 @@ class LogEngine:
             self.uncompared[-1].last = number
         elif len(self.uncompared) < MOST_REMARKS:
             self.uncompared.append(Apart(number, number, self.apart))
-
-
-def _events(log: StepLog) -> list[Event]:
-    """What the log says came in beside messages, or was lost before it came in."""
-    events: list[Event] = [Refused(one.source, one.reason, one.count, dropped=True) for one in log.dropped]
-    for event in log.events:
-        kind, source = event.get("kind"), event.get("source")
-        if kind in ("found", "lost") and isinstance(source, str):
-            events.append((SourceFound if kind == "found" else SourceLost)(source))
-        elif kind == "skipped" and isinstance(event.get("steps"), int):
-            events.append(Skipped(event["steps"]))
-        elif kind == "era" and isinstance(event.get("time"), int):
-            events.append(NewEra(event["time"]))
-        elif (order := order_of(event)) is not None:
-            events.append(order)
-    return events

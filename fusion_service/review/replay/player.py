@@ -5,9 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable
 
-from fusion_service.centre import Centre, Event, NewEra, StepResult, make_centre
+from fusion_service.centre import Centre, Event, StepResult, make_centre
+from fusion_service.centre.inputs import Input
+from fusion_service.centre.retracing import step_again
 from fusion_service.config import CentreConfig
-from fusion_service.review.replay.inputs import Input
 from fusion_service.review.replay.variants import Variant
 from schemas.messages import TENTATIVE
 
@@ -47,13 +48,7 @@ class Player:
             return "there is no centre to make it"
         begin = time.perf_counter()
         try:
-            for event in events:
-                centre.handle(event, at)
-            if at <= centre.time:
-                centre.handle(NewEra(at - 1), at)
-            for one in inputs:
-                centre.handle(one.message, max(one.received, getattr(one.message, "time", 0), one.message.epoch, at))
-            result = centre.step(at)
+            result = step_again(centre, events, inputs, at)
         except Exception as error:  # a recording may hold anything
             return f"{type(error).__name__}: {error}"
         self.seconds += time.perf_counter() - begin

@@ -1,4 +1,4 @@
-"""Recorded inputs that a step log may still name, by their digest.
+"""Inputs that a step log may still name, by their digest: of a recording, or of a centre that another one follows.
 
 A log comes after what it took, so that little has to be held: a message goes when a log has named it, or when it is too
 old for any step to take. But the last few of each source and kind stay, since a source sends them again to a service
@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from fusion_service.centre import source_of
+from fusion_service.centre.pictures import source_of
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, SensorInfo, StepLog
 
 __all__ = ["Input", "InputBuffer", "LocalMessage"]
@@ -20,6 +20,7 @@ SENT_AGAIN = 8
 """Messages of a source and kind that its publisher sends to who comes later."""
 MOST_BYTES = 256 * 2**20
 MOST_INPUTS = 200_000
+MOST_NAMES = 10_000
 SWEEP = 64
 """Logs between two looks for what is too old."""
 MARGIN = 60.0
@@ -31,12 +32,15 @@ LocalMessage = LocalTracks | LocalIntensity | SensorInfo | GlobalTracks
 
 @dataclass(slots=True)
 class Input:
-    """A message that a step may take; received, ns; size of it, bytes; named: whether a log has named it."""
+    """A message that a step may take; received, ns; size of it, bytes; named: whether a log has named it; key: on
+    which it came, and data: its bytes, where they are to be handed on."""
 
     message: LocalMessage
     received: int
     size: int
     named: bool = False
+    key: str = ""
+    data: bytes = b""
 
 
 class InputBuffer:
@@ -59,6 +63,8 @@ class InputBuffer:
         self._inputs[code] = one
         self._bytes += one.size
         recent = self._recent.setdefault((source_of(one.message), one.message.type), deque())
+        if len(self._recent) > MOST_NAMES:
+            del self._recent[next(iter(self._recent))]
         recent.append(code)
         if len(recent) > SENT_AGAIN:
             old = recent.popleft()
@@ -109,7 +115,7 @@ class InputBuffer:
 
     def _name(self, code: int, one: Input) -> None:
         one.named = True
-        if code not in self._recent[source_of(one.message), one.message.type]:
+        if code not in self._recent.get((source_of(one.message), one.message.type), ()):
             self._drop(code)
 
     def _drop(self, code: int) -> None:

@@ -1,0 +1,93 @@
+"""Which part a process has in its centre: active, or standing by for the one that is; and what follows when it ends.
+
+One that starts while another of its name is active stands by, whatever it was started as; one that stood down does so
+too. Every part has a session of its own on the bus, so that with it everything ends that was declared; another one, on
+which nothing is watched, is there all the time to ask the hub who is active.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Callable
+from contextlib import AbstractContextManager, ExitStack
+from typing import Protocol
+
+from fusion_service.bus import Bus
+from fusion_service.config import ServiceConfig
+from fusion_service.service.standby import Standby
+from fusion_service.service.state import State
+from fusion_service.service.tenure import Tenure, terms_held
+from schemas import token_key
+
+__all__ = ["Active", "succeed"]
+
+log = logging.getLogger(__name__)
+
+
+class Active(Protocol):
+    """The service, as the part that is active."""
+
+    def run(self, stop: threading.Event, begun: Callable[[], None] | None = None) -> None: ...
+
+    def feed(self, source: str, key: str, data: bytes, received: int) -> None: ...
+
+
+def succeed(
+    config: ServiceConfig,
+    state: State,
+    stop: threading.Event,
+    join: Callable[[], AbstractContextManager[Bus]],
+    make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
+    standby: bool,
+) -> None:
+    """Run as what the process is, one part after the other, until `stop` is set. join: opens a session on the bus;
+    make: the service on one. Raises what they do."""
+    with join() as probe:
+        while not stop.is_set():
+            standby = _part(config, state, stop, join, make, standby, probe)
+
+
+def _part(
+    config: ServiceConfig,
+    state: State,
+    stop: threading.Event,
+    join: Callable[[], AbstractContextManager[Bus]],
+    make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
+    standby: bool,
+    probe: Bus,
+) -> bool:
+    """Be one part until it ends; whether the next is to stand by."""
+    holds = token_key(config.centre.name, "holds", "*", config.bus.realm)
+    if not standby and (terms := terms_held(probe.present(holds)[0])):
+        log.warning("a centre named %s is active, term %d: standing by for it", config.centre.name, terms[-1])
+        return True
+    with ExitStack() as stack:
+        waiting: Standby | None = None
+        why = ""
+        if standby:
+            heard = stack.enter_context(ExitStack())
+            waiting = Standby(config, heard.enter_context(join()), probe, state)
+            heard.callback(waiting.join)
+            heritage = waiting.wait(stop)
+            if heritage is None:
+                return True
+            state.inherit(heritage.checkpoint, heritage.ended, heritage.generation, heritage.epoch)
+            why = f"took over: {heritage.why}"
+        bus = stack.enter_context(join())
+        service = make(config, bus, state, Tenure(config, bus, probe, why))
+        service.run(stop, _hand_on(waiting, service, heard, stack) if waiting is not None else None)
+    return True
+
+
+def _hand_on(waiting: Standby, service: Active, heard: ExitStack, stack: ExitStack) -> Callable[[], None]:
+    """Gives the service that has begun what waits for it, and ends the session on which that was heard, in a thread of
+    its own, since the last question there may wait for its answer; `stack` waits for that at the end."""
+
+    def begun() -> None:
+        waiting.hand_on(lambda source, one: service.feed(source, one.key, one.data, one.received))
+        closing = threading.Thread(target=heard.close)
+        closing.start()
+        stack.callback(closing.join)
+
+    return begun
