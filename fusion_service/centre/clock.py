@@ -83,8 +83,8 @@ class MessageClock:
     whether one is far ahead or far behind; of two nobody can tell which is wrong, and the earlier one is
     followed, since a step too far cannot be taken back. But steps go on: when the refused one has gone on for
     the lead by its own count (of which a single message makes up a tenth at most), and the median has not
-    moved by one period in that time, it is followed. Who is behind the clock by more than one and a half
-    leads has no say in that, and the clock waits for nobody who is behind by more than one, was refused last, is
+    moved by one period in that time, it is followed. Who is behind the clock by more than half the
+    lead has no say in that, and the clock waits for nobody who is behind by more than the lead, was refused last, is
     silent, or is so far behind that its next message will be too late.
 
     What is too late for the newest step is for the centre to refuse, in the next step; but where nothing else comes
@@ -149,7 +149,7 @@ class MessageClock:
             if known:
                 self._look_again()
         self._pass(one, time, received)
-        if not self._has_a_say(source, one):
+        if not self._has_a_say(source):
             one.says(time, self._now, self._bound, self._voting)
             return self._take_beside(one, time)
         if not self._is_late(time):
@@ -184,8 +184,13 @@ class MessageClock:
         return self._front if allowed is None else min(self._front, allowed)
 
     def _allowed(self) -> int | None:
-        known = [one for name, one in self._sources.items() if self._has_a_say(name, one)]
-        return bound(known, self._now, self._bound, self._voting)
+        return bound(self._voters(), self._now, self._bound, self._voting)
+
+    def _voters(self) -> list[_Source]:
+        """Those named, where one of them speaks; else all."""
+        known = [self._sources[name] for name in self._named or () if name in self._sources]
+        speak = any(one.claimed >= 0 and one.token is not False and not is_silent(one, self._now) for one in known)
+        return known if speak else list(self._sources.values())
 
     def _pass(self, one: _Source, time: int, received: int | None) -> None:
         """Let time of reception pass until this message of `one`."""
@@ -195,16 +200,9 @@ class MessageClock:
             self._now += min(max(received - self._received, 0), self._lead) if self._received >= 0 else 0
             self._received = received
 
-    def _has_a_say(self, source: str, one: _Source) -> bool:
-        """Whether it has a vote, or none of those has who alone should."""
-        if self._named is None or source in self._named:
-            return True
-        known = (self._sources.get(name) for name in self._named)
-        return not any(
-            other.claimed >= 0 and other.token is not False and not is_silent(other, self._now)
-            for other in known
-            if other is not None
-        )
+    def _has_a_say(self, source: str) -> bool:
+        """Whether it has a vote, or none of those speaks who alone should."""
+        return self._named is None or source in self._named or len(self._voters()) == len(self._sources)
 
     def _take_beside(self, one: _Source, time: int) -> bool:
         """A message of who has no say: it is taken unless it is too far ahead of the clock."""
@@ -254,13 +252,14 @@ class MessageClock:
         return newest >= self._front - self._lateness - self._period if one.token is None else one.token
 
     def _median(self, asking: _Source, awake: bool = False) -> int:
-        """The earlier median of what the live sources claim; awake: but those that are silent."""
+        """The earlier median of what the live sources claim that have a vote; awake: but those that are silent."""
+        base = self._bound if self._bound >= 0 else self._front - self._lead
         claims = sorted(
             one.claimed
-            for one in self._sources.values()
+            for one in self._voters()
             if one is asking
             or (
-                one.claimed >= max(0, self._front - self._lead * 3 // 2)
+                one.claimed >= max(0, base - self._lead // 2)
                 and self._is_live(one, one.claimed)
                 and not (awake and is_silent(one, self._now))
             )
@@ -308,12 +307,12 @@ class MessageClock:
     def _reached(self, time: int, limit: int) -> bool:
         """Whether everybody who is waited for has said `time`, of a clock that may go until `limit`."""
         centres = False
-        for name, one in self._sources.items():
+        for one in self._voters():
             if one.newest >= time or one.refused >= 0 or not self._is_live(one, one.newest):
                 continue
             if 0 <= one.newest < max(limit - self._lead, time - self._lateness - one.gap):
                 continue
-            if is_silent(one, self._now) or not self._has_a_say(name, one):
+            if is_silent(one, self._now):
                 continue
             if not one.centre:
                 return False

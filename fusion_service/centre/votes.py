@@ -57,7 +57,7 @@ class Voter:
         if self.claimed < 0:
             self.gap, self.pace, self.heard = rule.period, max(rule.period, rule.lateness), now
         elif time > self.claimed:
-            self.gap = max(min(time - self.claimed, rule.lead // 10), round(KEEPS * self.gap))
+            self.gap = max(min(time - self.claimed, 10 * rule.lead), round(KEEPS * self.gap))
             self.pace = max(now - self.heard, round(KEEPS * self.pace))
             self.heard = now
         elif time < self.claimed - rule.lateness:
@@ -98,7 +98,7 @@ def bound(sources: Collection[Voter], now: int, reached: int, rule: Voting) -> i
     if rule.earned and reached >= 0:
         earned = [one for one in voters if one.agreed >= EARNED]
         voters = [one for one in earned if one.agrees(reached)] or earned or voters
-        earlier = min((one.claimed for one in earned), default=None)
+        earlier = min((one.claimed + one.gap for one in earned), default=None)
     if not voters:
         return None
     votes = sorted(one.claimed + one.gap for one in voters)

@@ -73,7 +73,7 @@ def honest(*names: str) -> dict[str, Claim]:
 
 
 @pytest.mark.parametrize("named", [(), ("a", "b", "c")], ids=["open", "named"])
-@pytest.mark.parametrize("wrong", [18.0, 60.0, 3600.0, -4.0, -18.0, -60.0, -3600.0])
+@pytest.mark.parametrize("wrong", [18.0, 60.0, 3600.0, -4.0, -18.0, -60.0, -100.0, -3600.0])
 def test_one_of_three_moves_the_clock_for_nobody(named: tuple[str, ...], wrong: float) -> None:
     Play(named).check({**honest(), "c": off(wrong)}, 0, 200, behind=6.0 if -LATENESS < wrong < 0 else 2.0)
 
@@ -93,6 +93,16 @@ def test_four_names_of_one_intruder_do_not_take_an_open_bus_ahead(ahead: float) 
     play = Play()
     play.check(honest(), 0, 20, behind=2.0)
     play.check(honest() | {f"x{k}": off(ahead) for k in range(4)}, 20, 400, behind=2.0)
+
+
+@pytest.mark.parametrize("behind", [6.0, 18.0, 36.0, 50.0, 74.0, 76.0, 100.0, 3600.0])
+@pytest.mark.parametrize("named", [(), HONEST])
+def test_four_names_far_behind_refuse_nobody(behind: float, named: tuple[str, ...]) -> None:
+    """On an open bus a majority that is behind is followed as long as it is not too far; what the others say waits."""
+    play = Play(named)
+    play.check(honest(), 0, 20, behind=2.0)
+    claims = honest() | {f"x{k}": off(-behind) for k in range(4)}
+    play.check(claims, 20, 400, behind=2.0 if named else min(behind, LEAD) + 2.0)
 
 
 @pytest.mark.parametrize("pace", [1.1, 1.5, 3.0])
@@ -161,6 +171,13 @@ def test_a_slow_source_is_waited_for_and_does_not_slow_the_others() -> None:
     for k in range(3):  # every ten seconds
         claims[f"slow{k}"] = lambda at, k=k: at if int(at) % 10 == 3 * k else None  # type: ignore[misc]
     Play().check(claims, 0, 400, behind=LATENESS + 1.0, settled=50)
+
+
+@pytest.mark.parametrize("named", [(), ("a", "sparse")])
+def test_a_sparse_source_does_not_slow_the_other(named: tuple[str, ...]) -> None:
+    """A report every hundred seconds, and a few of them in a row at times."""
+    claims: dict[str, Claim] = {"a": right, "sparse": lambda at: at if int(at) % 100 < 1 + int(at) // 500 % 2 else None}
+    Play(named).check(claims, 0, 2000, behind=LATENESS + 1.0, settled=250)
 
 
 def test_a_source_that_catches_up_is_waited_for_again() -> None:
