@@ -6,7 +6,7 @@ import heapq
 from dataclasses import dataclass
 
 from fusion_service.centre.pictures import is_picture_of, source_of
-from fusion_service.centre.votes import Voter, Voting, bound, is_silent, named
+from fusion_service.centre.votes import Voter, Voting, bound, first_pace, is_silent, named
 from fusion_service.config import CentreConfig
 from schemas import GlobalTracks, LocalIntensity, LocalTracks
 
@@ -175,7 +175,7 @@ class MessageClock:
         one = self._source(source)
         one.token = alive
         if one.claimed < 0:
-            one.heard, one.pace = self._now, max(self._period, self._lateness)
+            one.heard, one.pace = self._now, first_pace(self._voting)
         self._reference = -1
 
     def limit(self) -> int:
@@ -310,7 +310,7 @@ class MessageClock:
         for one in self._voters():
             if one.newest >= time or one.refused >= 0 or not self._is_live(one, one.newest):
                 continue
-            if 0 <= one.newest < max(limit - self._lead, time - self._lateness - one.gap):
+            if 0 <= one.newest < max(limit - self._lead, time - self._lateness - max(one.gap, self._period)):
                 continue
             if is_silent(one, self._now):
                 continue

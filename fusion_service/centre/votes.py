@@ -7,9 +7,9 @@ cannot be taken back, while data that are early wait.
 
 Votes have those who are named in the config, or, where certificates say who is who, all. Else anybody can make up any
 number of names, and more is asked: a vote is earned by `EARNED` scans that agree with the clock, and rests while what
-its source says is ahead of what the others allow; and the clock goes ahead of none of these who goes on by
-more than the lead. Who is behind by more than the lead has no vote, nor has who is silent: who has not gone on for
-three times its usual pace, in the time of reception.
+its source says is ahead of what the others allow; and the clock goes ahead of none of these who goes on by more than
+the lead. Who is behind by more than the lead has no vote, nor has who is silent: who has not gone on for three times
+its usual pace, in the time of reception.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from typing import NamedTuple
 
 from fusion_service.config import CentreConfig
 
-__all__ = ["EARNED", "Voter", "Voting", "bound", "is_silent", "named"]
+__all__ = ["EARNED", "Voter", "Voting", "bound", "first_pace", "is_silent", "named"]
 
 EARNED = 3
 SILENT = 3
 """A source is silent after so many times its usual pace."""
-KEEPS = 0.8
+KEEPS = 0.9
 """What a usual gap keeps of itself from one message to the next, where that comes sooner."""
 
 
@@ -55,7 +55,7 @@ class Voter:
     def says(self, time: int, now: int, reached: int, rule: Voting) -> None:
         """A message that holds at `time` came at `now`; reached: how far the clock may go until here, -1: anywhere."""
         if self.claimed < 0:
-            self.gap, self.pace, self.heard = rule.period, max(rule.period, rule.lateness), now
+            self.gap, self.pace, self.heard = rule.period, first_pace(rule), now
         elif time > self.claimed:
             self.gap = max(min(time - self.claimed, 10 * rule.lead), round(KEEPS * self.gap))
             self.pace = max(now - self.heard, round(KEEPS * self.pace))
@@ -83,6 +83,11 @@ def named(config: CentreConfig) -> frozenset[str] | None:
     return names if config.clock_votes == "configured" or (config.clock_votes == "auto" and names) else None
 
 
+def first_pace(rule: Voting) -> int:
+    """What is taken for the pace of who was heard once, or not yet: it is silent after `lateness`, or a period."""
+    return max(rule.period, rule.lateness) // SILENT
+
+
 def is_silent(one: Voter, now: int) -> bool:
     """Whether a source that was heard once, or has its token, has not gone on for long."""
     return now - one.heard > SILENT * one.pace
@@ -93,7 +98,7 @@ def bound(sources: Collection[Voter], now: int, reached: int, rule: Voting) -> i
     the first); None: none of them has a say."""
     awake = [one for one in sources if one.claimed >= 0 and one.token is not False and not is_silent(one, now)]
     awake = [one for one in awake if not one.centre] or awake
-    voters = [one for one in awake if one.claimed >= reached - rule.lead] or awake
+    voters = [one for one in awake if one.claimed + one.gap >= reached - rule.lead] or awake
     earlier = None
     if rule.earned and reached >= 0:
         earned = [one for one in voters if one.agreed >= EARNED]

@@ -12,8 +12,9 @@ import msgpack
 import pytest
 
 import schemas
-from fusion_service.centre import Order
+from fusion_service.centre import FusionCentre, Order
 from fusion_service.service.held import HeldOrders
+from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.promises import MOST_WAITING, PATIENCE, Promises
 from tests.helpers.processes import Hub, Program, eventually
 from tests.helpers.scene import Scene, opened
@@ -195,3 +196,44 @@ def test_promises_are_bounded_and_each_is_answered_once() -> None:
     assert isinstance(said[-1], ValueError)
     assert len(said) == MOST_WAITING
     assert promises.wait() == float("inf")
+
+
+def test_a_certificate_proves_who_ordered_and_with_certificates_nobody_else_does() -> None:
+    centre, said, put = FusionCentre({}), [], []
+    desk = OrderDesk(put.append, secured=True)
+    desk.follow(centre)
+    request = msgpack.packb({"what": "mute", "source": "r1", "who": "eve", "proven": False})
+    with pytest.raises(ValueError, match="by certificate"):
+        desk.answer(request, said.append)
+    desk.answer(None, said.append)
+    assert msgpack.unpackb(said.pop())["orders"] == []
+    desk.answer(request, said.append, "alice")
+    [order] = put
+    assert (order.who, order.proven, order.giver) == ("alice", True, "alice")
+    centre.handle(order, 0)
+    log = centre.step(10**18).log
+    desk.follow(centre)
+    assert said == []
+    desk.promises.settle(log.events, kept=True)
+    assert msgpack.unpackb(said.pop()) == {
+        "number": 1, "done": True, "track": None, "kept": True,
+        "outcome": "refuses what r1 sends, of which nothing was heard yet",
+    }
+    desk.answer(None, said.append)
+    [listed] = msgpack.unpackb(said.pop())["orders"]
+    assert (listed["who"], listed["proven"]) == ("alice", True)
+    again = FusionCentre({}, checkpoint=centre.checkpoint())
+    assert again.orders.listed() == [listed]
+    open_desk = OrderDesk(put.append)
+    open_desk.follow(FusionCentre({}))
+    open_desk.answer(msgpack.packb({"what": "mute", "source": "r1", "proven": True}), said.append, "alice")
+    assert (put[-1].who, put[-1].proven, put[-1].giver) == ("alice", False, "alice (unproven)")
+
+
+def test_a_process_that_lost_the_name_promises_nothing() -> None:
+    promises, said = Promises(), list[Any]()
+    promises.make(Order("mute", "r", number=1), "will be", said.append)
+    promises.may = lambda: False
+    promises.settle([{"number": 1, "done": True, "outcome": "yes"}], kept=True)
+    [error] = said
+    assert isinstance(error, ValueError)
