@@ -6,6 +6,7 @@ import signal
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +30,7 @@ class Seconds:
         return self.now
 
 
-def flow(**limits: float) -> tuple[Flow, Seconds]:
+def flow(**limits: Any) -> tuple[Flow, Seconds]:
     clock = Seconds()
     none = LimitsConfig(messages=0.0, bytes=0.0, tracks=0.0)
     return Flow(replace(none, **limits), clock), clock

@@ -199,7 +199,7 @@ def test_promises_are_bounded_and_each_is_answered_once() -> None:
 
 
 def test_a_certificate_proves_who_ordered_and_with_certificates_nobody_else_does() -> None:
-    centre, said, put = FusionCentre({}), [], []
+    centre, said, put = FusionCentre({}), list[Any](), list[Order]()
     desk = OrderDesk(put.append, secured=True)
     desk.follow(centre)
     request = msgpack.packb({"what": "mute", "source": "r1", "who": "eve", "proven": False})
@@ -216,7 +216,10 @@ def test_a_certificate_proves_who_ordered_and_with_certificates_nobody_else_does
     assert said == []
     desk.promises.settle(log.events, kept=True)
     assert msgpack.unpackb(said.pop()) == {
-        "number": 1, "done": True, "track": None, "kept": True,
+        "number": 1,
+        "done": True,
+        "track": None,
+        "kept": True,
         "outcome": "refuses what r1 sends, of which nothing was heard yet",
     }
     desk.answer(None, said.append)
