@@ -59,7 +59,7 @@ __all__ = [
 
 LATER = (
     *("trigger", "arrival_spacing", "revise", "weights", "compiled", "clock_votes"),
-    *("track_components", "message_components", "component_pairs", "forget"),
+    *("track_components", "message_components", "component_pairs", "forget", "suspend"),
 )
 """Settings that came after hashes were recorded; their defaults are what there was before, or `BEFORE` says."""
 BEFORE: dict[str, Any] = {
@@ -70,6 +70,7 @@ BEFORE: dict[str, Any] = {
     "message_components": 2**24,
     "component_pairs": 2**62,
     "forget": 0.0,
+    "suspend": False,
 }
 """What stands where recorded settings do not say them."""
 
@@ -234,7 +235,14 @@ class CentreConfig:
     forget: float = _setting(
         300.0, DURATION, "seconds after which a source that is gone and silent is forgotten; 0: none is, nor rests"
     )
-    remember: float = _setting(600.0, DURATION, "seconds for which a stale track's id and interval are remembered")
+    remember: float = _setting(
+        600.0,
+        DURATION,
+        "seconds for which a stale track's id, link and interval, and a suspended track, are remembered",
+    )
+    suspend: bool = _setting(
+        True, flag, "tracks that only sources silent as a whole could see are suspended, and do not end, after coast"
+    )
     intensity_rule: str = _setting(
         "hybrid",
         choice("aa", "ga", "hybrid"),

@@ -372,7 +372,7 @@ class Service:
                 skipped=self._times.skipped,
                 overload=None if since is None else time.monotonic() - since,
                 busy=busy,
-                more=self._tenure.notes(),
+                more=(*self._tenure.notes(), *filter(None, [self._lasting.alarm])),
             )
             status = self._flow.told_in(status)
             status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
