@@ -70,11 +70,11 @@ class _Source(Voter):
 
 
 class MessageClock:
-    """Steps at t = k * period when every live source has reached t, or the newest message is more than
-    `lateness` past it.
+    """Steps at t = k * period when every live source has reached t, or the newest message, as far as it is followed, is
+    more than `lateness` past it.
 
-    No step is made ahead of what the votes of the sources allow (`votes`), whoever is further ahead; who has no vote
-    while others have is not waited for, and what it says moves nothing.
+    It is followed as far as the votes of the sources allow (`votes`), whoever is further ahead; who has no vote while
+    others have is not waited for, and what it says moves nothing.
 
     A source is live while its token is there, or, if it never had one, while its messages keep up. Where sources
     disagree about the time by more than the lead (`LEAD` seconds, `lateness` and ten periods), the median of what
