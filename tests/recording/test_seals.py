@@ -416,7 +416,7 @@ def test_two_recordings_grafted(signed: Path, signer: Signer, authority: Authori
 
 
 def test_older_recordings_are_not_sealed(ca: Ca, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for path in (Path(__file__).parents[1] / "recordings").rglob("*.rrd"):
+    for path in (Path(__file__).parents[1] / "recordings" / "0.1.0").glob("*.rrd"):
         found = verify(path)
         assert (found.state, found.bad, found.messages) == ("not sealed", False, len(list(read(path))))
     assert main(["verify", str(path)]) == 0
@@ -648,7 +648,7 @@ def test_a_part_by_another_hand_is_told(signer: Signer, authority: Authority, ke
     before = tmp_path / "before"
     before.mkdir()
     shutil.copy(tmp_path / "m" / "0001.rrd", before / "0002.rrd")
-    shutil.copy(Path(__file__).parents[1] / "recordings" / "memory.rrd", before / "0001.rrd")
+    shutil.copy(Path(__file__).parents[1] / "recordings" / "0.1.0" / "memory.rrd", before / "0001.rrd")
     found = verify(before)
     assert (found.state, found.whole, found.messages - found.unsealed) == ("doubtful", COUNT, COUNT)
 
