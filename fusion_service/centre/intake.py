@@ -156,8 +156,8 @@ class Intake:
 
     @property
     def lossy(self) -> bool:
-        """Whether data were dropped since the last step."""
-        return any(dropped for _, _, dropped in self._refused)
+        """Whether data were dropped since the last step because there was too much to do, not for one source's flow."""
+        return any(dropped and reason != "flow" for _, reason, dropped in self._refused)
 
     def names(self) -> tuple[str, ...]:
         """All sources, sorted."""

@@ -23,12 +23,13 @@ from fusion_service.commands import (
     replay,
     rules,
     run,
+    verify,
 )
 
 __all__ = ["COMMANDS"]
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rpartition(".")[2]: module
-    for module in (hub, keys, run, order, record, demo, check, rules, replay, evaluate, explain, export, repair)
+    for module in (hub, keys, run, order, record, demo, check, rules, replay, evaluate, explain, export, verify, repair)
 }
 """By name, in the order of the help."""

@@ -154,6 +154,11 @@ class State:
                 self._unwritten = f"no room could be reserved in {files.folder}: {error.strerror}"
                 log.error("%s", self._unwritten)
 
+    @property
+    def folder(self) -> Path | None:
+        """Where it is; None: nothing is kept."""
+        return self._folder
+
     def load(self) -> bytes | None:
         """The last checkpoint, or the one inherited, if there is one."""
         if self._heritage is not None:

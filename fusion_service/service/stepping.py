@@ -35,11 +35,12 @@ from fusion_service.centre import (
 )
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.held import HeldOrders, synced
 from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
 from fusion_service.service.young import born_in, noted
-from schemas import Message, encode, messages
+from schemas import Message, StepLog, encode, messages
 
 __all__ = ["SAVED_EVERY", "LastingCentre", "Made"]
 
@@ -98,6 +99,10 @@ class LastingCentre:
         self._faulty: dict[tuple[str, str, int, int], None] = {}
         self.centre = self._make_centre()
         desk.follow(self.centre)
+        self._held = HeldOrders(state.folder)
+        for order in self._held.read(self.centre.orders.next):
+            log.info("order %d of before is given again: %s", order.number, order.what)
+            self.handle(order, time.time_ns())
 
     def _usable(self, checkpoint: bytes | None) -> bytes | None:
         """The checkpoint, but for one that is of a time to come, by more than anything is remembered: it is set aside.
@@ -147,6 +152,7 @@ class LastingCentre:
     def step(self, at: int) -> Made | None:
         """Make the step at `at`, ns, saved if it must be before it is published; None where it fails even without what
         came in for it. Call `save` when it has been."""
+        unsaved = self._counts["unsaved"]
         try:
             made = self._make(at)
         except Exception:
@@ -157,7 +163,34 @@ class LastingCentre:
         finally:  # what waits for a later step may make that one fail
             self._since = [one for one in self._since if getattr(one[0], "time", -1) > at]
         self._desk.follow(self.centre)
+        self._settle(made.result.log, self._counts["unsaved"] == unsaved)
         return made
+
+    def _settle(self, journal: StepLog, saved: bool) -> None:
+        """Answer the orders of a step, whose checkpoint was `saved`."""
+        orders = [event for event in journal.events if event.get("kind") == "order"]
+        if not orders:
+            return
+        kept = saved and self._state.folder is not None
+        if kept and self._state.folder is not None:
+            try:
+                synced(self._state.folder)
+                self._held.saved(self.centre.orders.next)
+            except OSError as error:
+                kept = False
+                self._told.error("cannot keep what was ordered: %s", error)
+        self._desk.promises.settle(orders, kept)
+
+    def _hold_orders(self) -> None:
+        """Write down the orders that have waited for a step for too long, and answer them."""
+        overdue = self._desk.promises.overdue()
+        if overdue:
+            try:
+                kept = self._held.add(overdue)
+            except OSError as error:
+                kept = False
+                self._told.error("cannot keep what was ordered: %s", error)
+            self._desk.promises.hold(overdue, kept)
 
     @property
     def generation(self) -> int:
@@ -165,7 +198,8 @@ class LastingCentre:
         return self._generation
 
     def save(self, *, at_once: bool = False) -> None:
-        """Save what has changed, where that is due."""
+        """Save what has changed, where that is due, and orders that wait for a step."""
+        self._hold_orders()
         if self._changed and (at_once or time.monotonic() - self._saved_at >= SAVED_EVERY):
             self._keep(self.centre.checkpoint())
 

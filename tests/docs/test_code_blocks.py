@@ -276,7 +276,7 @@ def test_shell_lines_are_read(block: Block, words: list[str], monkeypatch: pytes
 
 TOPICS = {
     f"fusion-service {name}"
-    for name in ("evaluate", "replay", "explain", "export", "repair", "record", "run", "order", "keys")
+    for name in ("evaluate", "replay", "explain", "export", "repair", "verify", "record", "run", "order", "keys")
 } | {"sensor-client simulate", "sensor-client playback"}
 """In the text, a command may be named without what it must be given."""
 
