@@ -138,9 +138,9 @@ def connections(_: Bus) -> None:
     endpoint = sys.argv[1]  # of the program that a flood is
     host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
     with ExitStack() as stack:
-        for _ in range(1000):
+        for _one in range(1000):
             stack.enter_context(socket.create_connection((host, int(port)), timeout=10.0))
-        for _ in range(500):
+        for _one in range(500):
             with open_bus([endpoint], wait=30.0):
                 pass
 

@@ -10,6 +10,7 @@ import random
 import time
 from collections import Counter
 from pathlib import Path
+from statistics import median
 
 from fusion_service.recording import read
 from tests.chaos.report import Report
@@ -55,7 +56,8 @@ class Tally:
 
     def lines(self) -> list[str]:
         return [
-            f"{kind}: {self.tried[kind]} times, whole again after {max(self.back.get(kind, [0.0])):.1f} s at most,"
+            f"{kind}: {self.tried[kind]} times, whole again after {median(self.back.get(kind) or [0.0]):.1f} s,"
+            f" {max(self.back.get(kind) or [0.0]):.1f} at most,"
             f" ids kept {self.kept[kind]} of {len(TARGETS) * self.tried[kind]}"
             for kind in sorted(self.tried)
         ]

@@ -8,7 +8,9 @@ import traceback
 from collections import Counter
 from typing import Any
 
-from fusion_service.centre import Order, StepResult, make_centre
+import msgpack
+
+from fusion_service.centre import Order, make_centre
 from fusion_service.config import centre_config
 from fusion_service.order import STATES, WHAT
 from fusion_service.service.ordering import OrderDesk
@@ -31,51 +33,60 @@ def fuzz_orders(seed: int, until: float, most: int = 2**62) -> Report:
     rng = random.Random(seed)
     counts: Counter[str] = Counter()
     while report.tried < most and time.monotonic() < until:
-        centre, _ = make_centre(centre_config({"remember": 20.0}))
-        given: list[Order] = []
-        desk = OrderDesk(given.append)
-        result: StepResult | None = None
-        for second in range(1, STEPS):
-            now = START + second * SECOND
-            for _ in range(EACH if result is not None and report.tried < most else 0):
-                _order(rng, desk, result, report, counts)
-            for order in given:
-                desk.given(order)
-                centre.handle(order, now)
-            counts["obeyed or refused in a step"] += len(given)
-            given.clear()
-            for _, event, received in honest(centre.config, second):
-                centre.handle(event, received)
-            try:
-                result = centre.step(now)
-                look(result)
-                if second % 8 == 0:
-                    centre, fault = make_centre(centre.config, centre.checkpoint(), generation=second)
-                    counts["checkpoints refused"] += bool(fault)
-                desk.follow(centre)
-            except Exception:
-                report.escaped(f"the step failed: {traceback.format_exc(limit=-4)}")
-                break
+        try:
+            _mission(rng, most, report, counts)
+        except Exception:
+            report.escaped(f"the step failed: {traceback.format_exc(limit=-4)}")
     report.say(", ".join(f"{what} {count:,}" for what, count in counts.most_common()))
-    if counts["checkpoints refused"]:
-        report.escaped(f"{counts['checkpoints refused']} checkpoints are not read")
+    if counts["taken by the desk"] != counts["answered"]:
+        report.escaped("not every order was answered once")
     return report
 
 
-def _order(
-    rng: random.Random, desk: OrderDesk, result: StepResult | None, report: Report, counts: Counter[str]
-) -> None:
-    assert result is not None
-    data = mutated(rng, _sound(rng, [*result.picture.ids.tolist(), 1, 2**64 - 1]))
+def _mission(rng: random.Random, most: int, report: Report, counts: Counter[str]) -> None:
+    """Some seconds of honest sources, and orders about what there is."""
+    centre, _ = make_centre(centre_config({"remember": 20.0}))
+    given: list[Order] = []
+    desk = OrderDesk(given.append)
+    ids: list[int] = []
+    for second in range(1, STEPS):
+        now = START + second * SECOND
+        for _ in range(min(EACH if ids else 0, most - report.tried)):
+            _order(rng, desk, ids, report, counts)
+        for order in given:
+            desk.given(order)
+            centre.handle(order, now)
+        counts["in a step"] += len(given)
+        given.clear()
+        for _, event, received in honest(centre.config, second):
+            centre.handle(event, received)
+        result = centre.step(now)
+        look(result)
+        desk.promises.settle((event for event in result.log.events if event.get("kind") == "order"), kept=True)
+        ids = result.picture.ids.tolist()
+        if second % 8 == 0:
+            centre, fault = make_centre(centre.config, centre.checkpoint(), generation=second)
+            assert not fault, fault
+        desk.follow(centre)
+
+
+def _order(rng: random.Random, desk: OrderDesk, ids: list[int], report: Report, counts: Counter[str]) -> None:
+    data = mutated(rng, _sound(rng, [*ids, 1, 2**64 - 1]))
     report.tried += 1
+
+    def reply(answer: bytes | Exception) -> None:
+        counts["answered"] += 1
+        if not isinstance(answer, bytes) or not isinstance(msgpack.unpackb(answer), dict):
+            report.escaped(f"an answer that is none: {answer!r}", data)
+
     try:
-        desk.answer(data, rng.choice(("", "", "alice", "a b")))
+        desk.answer(data, reply, rng.choice(("", "", "alice", "a b")))
     except ValueError:
-        counts["refused at the desk"] += 1
+        counts["refused by the desk"] += 1
     except Exception:
         report.escaped(f"the desk: {traceback.format_exc(limit=-3)}", data)
     else:
-        counts["answered"] += 1
+        counts["taken by the desk"] += 1
 
 
 def _sound(rng: random.Random, ids: list[int]) -> dict[str, Any]:
