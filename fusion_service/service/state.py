@@ -124,7 +124,7 @@ class State:
             self._files.set_aside("generation", "refused")
             log.warning("%s held no generation (it is generation.refused now): ids go on above all known ones", path)
             return 0
-        if last < above:
+        if last < above and not self._inherits:
             log.warning("%s held %d, below the checkpoint's %d: ids go on above that", path, last, above)
         return last
 
