@@ -41,7 +41,7 @@ def test_orders_are_answered_or_refused() -> None:
 
 
 def test_what_is_killed_or_frozen_comes_back() -> None:
-    said(kills.kill_and_freeze(3, FOREVER, 2))
+    said(kills.kill_and_freeze(3, FOREVER, 1))
 
 
 def test_the_same_seed_gives_the_same_bytes_and_every_mutation_changes_some() -> None:
