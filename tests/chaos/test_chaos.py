@@ -96,12 +96,12 @@ def test_a_centre_that_raises_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_centre_that_loses_honest_targets_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     handle = FusionCentre.handle
-    loud: set[int] = set()
 
     def losing(self: FusionCentre, event: Any, received: int) -> None:
-        if getattr(event, "source", "") == "a1":
-            loud.add(id(self))
-        if not (id(self) in loud and getattr(event, "source", "") in centres.HONEST):
+        name = getattr(event, "source", "")
+        if name == "a1":
+            self.__dict__["loud"] = True
+        if not (name in centres.HONEST and "loud" in self.__dict__):
             handle(self, event, received)
 
     monkeypatch.setattr(FusionCentre, "handle", losing)
