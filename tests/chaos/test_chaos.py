@@ -6,11 +6,13 @@ import random
 from collections import Counter
 from typing import Any
 
+import numpy as np
 import pytest
 
 import schemas
-from fusion_service.centre import FusionCentre
+from fusion_service.centre import FusionCentre, make_centre
 from fusion_service.config import centre_config
+from tests.centre.worlds import FRAME, SECOND, START, info
 from tests.chaos import centres, decoding, kills, ordering
 from tests.chaos.__main__ import PARTS
 from tests.chaos.mutations import BASES, MUTATIONS, mutated
@@ -111,3 +113,16 @@ def test_a_centre_that_loses_honest_targets_is_found(monkeypatch: pytest.MonkeyP
 
 def test_every_part_has_a_name() -> None:
     assert {"decode", "centre", "orders", "kills", "disk", "clock", "connections", "floods"} == set(PARTS)
+
+
+def test_a_sensor_whose_place_may_be_anywhere_overflows_nothing() -> None:
+    for size in (1e300, 1e308, 1.7e308):
+        centre = make_centre(centre_config({"frame": FRAME}))[0]
+        covariance = np.full((3, 3), size / 2) + np.eye(3) * size / 2
+        for second in range(1, 4):
+            centre.handle(info("h1", seq=second, position_covariance=covariance.tolist()), START)
+            for _, event, received in centres.honest(centre.config, second):
+                if not isinstance(event, schemas.SensorInfo):
+                    centre.handle(event, received)
+            result = centre.step(START + second * SECOND)
+        assert len(result.picture.ids) == 3
