@@ -7,11 +7,12 @@ Compiled code is kept beside the kernels, or, where that place cannot be written
 from __future__ import annotations
 
 import os
+import sys
 import threading
 from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
-from types import FunctionType, SimpleNamespace
+from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
 from fusion_service.compiled import groups, kernels, three
@@ -70,8 +71,21 @@ def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> No
 
 
 def is_kept() -> bool:
-    """Whether an earlier process has compiled, as far as one can see beside the kernels."""
-    return any((Path(kernels.__file__).parent / "__pycache__").glob("kernels.*.nbi"))
+    """Whether an earlier process has compiled all kernels as they are, as far as one can see beside them: one that was
+    killed has compiled the first of them only."""
+    return all(_kept(name) for name in SHAPES)
+
+
+def _kept(name: str) -> bool:
+    source = Path(_home(name).__file__ or "")
+    python = f"py{sys.version_info.major}{sys.version_info.minor}"
+    found = (source.parent / "__pycache__").glob(f"{source.stem}.{name}-*.{python}*.nbc")
+    return any(one.stat().st_mtime >= source.stat().st_mtime for one in found)
+
+
+def _home(name: str) -> ModuleType:
+    """Where a kernel stands."""
+    return next(one for one in (kernels, groups, three) if hasattr(one, name))
 
 
 def _installed() -> bool:
@@ -96,7 +110,7 @@ def _compiled(wanted: bool, stop: threading.Event | None) -> tuple[str, SimpleNa
     for name in SHAPES:
         if stop is not None and stop.is_set():
             return PLAIN, None
-        home = next(one for one in (kernels, groups, three) if hasattr(one, name))
+        home = _home(name)
         for helper in HELPERS.get(name, ()):
             if helper not in _MADE:
                 _MADE[helper] = _kernel(numba, getattr(home, helper), ())

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import time
 from collections.abc import Iterator
+from pathlib import Path
 from threading import Event
+from types import SimpleNamespace
 
 import pytest
 
 from fusion_service.centre import FusionCentre
-from fusion_service.compiled import PLAIN, begin, road, use
+from fusion_service.compiled import PLAIN, begin, is_kept, road, use
 from fusion_service.compiled.either import FAST
-from fusion_service.compiled.road import VARIABLE
+from fusion_service.compiled.road import SHAPES, VARIABLE
 
 
 @pytest.fixture(autouse=True)
@@ -70,3 +74,23 @@ def test_what_is_wanted_and_stopped_is_not_compiled() -> None:
     stop = Event()
     stop.set()
     assert use("on", stop) == PLAIN
+
+
+def test_kernels_of_a_process_that_was_killed_while_it_compiled_are_not_all(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Nor are those of an older version of the source."""
+    source = tmp_path / "kernels.py"
+    source.write_text("", "utf-8")
+    monkeypatch.setattr("fusion_service.compiled.road._home", lambda name: SimpleNamespace(__file__=str(source)))
+    (tmp_path / "__pycache__").mkdir()
+    python = f"py{sys.version_info.major}{sys.version_info.minor}"
+    for name in SHAPES:
+        assert not is_kept()
+        (tmp_path / "__pycache__" / f"kernels.{name}-7.{python}.nbi").touch()
+        assert not is_kept(), "the code itself is written after its index, or never"
+        (tmp_path / "__pycache__" / f"kernels.{name}-7.{python}.1.nbc").touch()
+    assert is_kept()
+    later = time.time() + 100
+    os.utime(source, (later, later))
+    assert not is_kept()
