@@ -82,7 +82,9 @@ def test_kernels_of_a_process_that_was_killed_while_it_compiled_are_not_all(
     """Nor are those of an older version of the source."""
     source = tmp_path / "kernels.py"
     source.write_text("", "utf-8")
-    monkeypatch.setattr("fusion_service.compiled.road._home", lambda name: SimpleNamespace(__file__=str(source)))
+    monkeypatch.setattr(
+        sys.modules["fusion_service.compiled.road"], "_home", lambda name: SimpleNamespace(__file__=str(source))
+    )
     (tmp_path / "__pycache__").mkdir()
     python = f"py{sys.version_info.major}{sys.version_info.minor}"
     for name in SHAPES:
