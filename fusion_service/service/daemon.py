@@ -33,6 +33,7 @@ from fusion_service.centre import (
 from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.complaints import Complaints
 from fusion_service.service.heartbeat import Heartbeat
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
@@ -108,6 +109,7 @@ class Service:
         self._status = StatusMaker(config.centre.name)
         self._counts = self._status.counts
         self._told = BoundedLog(config.service.log_refusals)
+        self._complaints = Complaints(config.centre, self._told)
         self._tokens = Tokens(self._inbox.wake)
         self._desk = OrderDesk(lambda order: self._inbox.put("", order))
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
@@ -248,13 +250,18 @@ class Service:
         except ValueError as error:
             reason = error.reason if isinstance(error, MessageError) else "key"
             self._lasting.handle(Refused(name[:64], reason), item.received)
+            self._complaints.misread(name[:64], item.data, error, item.received)
             return
         if source_of(message) != name:
             self._lasting.handle(Refused(name, "source"), item.received)
+            self._complaints.misnamed(name, source_of(message), item.received)
             return
+        self._complaints.heard(name, message, len(item.data), item.received)
         fault = ""
         if isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)):
             fault = self._times.fault(message, item.received)
+            if fault:
+                self._complaints.refused(name, fault, message, item.received)
         self._lasting.handle(Refused(name, fault) if fault else message, item.received)
 
     def _note_tokens(self) -> bool:
@@ -312,6 +319,7 @@ class Service:
         if notes and self._told.allows(notes[0], 600.0):
             log.warning("%s", "; ".join(notes))
         self._tell_sources(made.result.log)
+        self._complaints.stepped(made.result.log)
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
@@ -337,6 +345,7 @@ class Service:
         last = self._result.status if self._result is not None else None
         self._refused = self._lasting.centre.refusals()
         self._told.refusals(self._refused, last.dropped if last is not None else {})
+        self._complaints.think(self._tokens.told, self._result.picture.frame if self._result is not None else None)
         status = self._say_status()
         if self._overload.since is not None and status.notes:
             self._told.warn("%s", status.notes[0])
@@ -357,7 +366,8 @@ class Service:
                 busy=busy,
                 more=self._tenure.notes(),
             )
-            status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
+            sources = self._complaints.told(status.sources)
+            status = replace(status, sources=sources, term=self._tenure.term, standby=self._tenure.numbers())
             self._put("status", encode(status))
             self._heart.beat()
         return status
