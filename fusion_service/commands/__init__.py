@@ -17,18 +17,36 @@ from fusion_service.commands import (
     export,
     hub,
     keys,
+    listen,
     order,
     record,
     repair,
     replay,
     rules,
     run,
+    status,
 )
 
 __all__ = ["COMMANDS"]
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rpartition(".")[2]: module
-    for module in (hub, keys, run, order, record, demo, check, rules, replay, evaluate, explain, export, repair)
+    for module in (
+        hub,
+        keys,
+        run,
+        status,
+        listen,
+        order,
+        record,
+        demo,
+        check,
+        rules,
+        replay,
+        evaluate,
+        explain,
+        export,
+        repair,
+    )
 }
 """By name, in the order of the help."""

@@ -23,6 +23,8 @@ ENOUGH = 4
 PATIENCE = 3.0
 """Seconds that a source may take to say what it is."""
 KEPT = 32
+SPAN = 5 * 10**9
+"""ns over which it is looked how tracks move."""
 MOST_TIMES = 86400.0
 """Seconds between clocks beyond which a mission is played at its own time."""
 
@@ -35,6 +37,7 @@ class Listened:
         self.info: SensorInfo | None = None
         self.newest: about.Glimpse | None = None
         self._before: about.Glimpse | None = None
+        self._anchor: about.Glimpse | None = None
         self._first = 0
         self._came: deque[int] = deque(maxlen=KEPT)
         self._clock: deque[float] = deque(maxlen=KEPT)
@@ -54,6 +57,9 @@ class Listened:
             self._seqs.append((message.epoch, message.seq))
             if self.newest is None or message.time > self.newest.time or message.epoch != self.newest.epoch:
                 self._before, self.newest = self.newest, about.glimpse(message)
+                anchor = self._anchor
+                if anchor is None or anchor.epoch != message.epoch or message.time - anchor.time > SPAN:
+                    self._anchor = self._before
 
     @property
     def rate(self) -> float | None:
@@ -81,7 +87,9 @@ class Listened:
         if self.newest is not None:
             said += [about.places_doubt(self.newest), about.angles_doubt(self.newest), self._coverage()]
         if self.newest is not None and self._before is not None:
-            said += [about.order_doubt(self._before, self.newest), about.ids_doubt(self._before, self.newest)]
+            said.append(about.ids_doubt(self._before, self.newest))
+        if self.newest is not None and self._anchor is not None:
+            said.append(about.order_doubt(self._anchor, self.newest))
         return said
 
     def _runs(self) -> list[str]:

@@ -30,6 +30,8 @@ SOME = 64
 """Tracks of a message that are looked at, and kept."""
 FAR = 500e3
 """Metres between frames of one picture beyond which something is said."""
+MOST_SIGMAS = 4.0
+"""Velocities that differ by less than so many standard deviations of the places' change say nothing."""
 ORDERS = (("x", "vx", "y", "vy"), ("y", "x", "vy", "vx"), ("vx", "vy", "x", "y"), ("x", "y", "vy", "vx"))
 
 
@@ -171,7 +173,10 @@ def order_doubt(before: Glimpse, now: Glimpse) -> str:
         size = np.maximum(np.hypot(*rate.T), np.hypot(*said.T))
         errors[order] = float(np.median(np.hypot(*(rate - said).T) / np.maximum(size, 1e-9))), float(np.median(size))
     wrong, size = errors[told]
-    if wrong < 0.8 or size < 1.0:
+    places = [columns["x"], columns["y"]]
+    spread = (before.covariances[old][:, places, places] + now.covariances[new][:, places, places]).sum(axis=1)
+    noise = float(np.median(np.sqrt(np.maximum(spread, 0.0)))) / seconds
+    if wrong < 0.8 or size < max(1.0, MOST_SIGMAS * noise):
         return ""
     best = min(ORDERS, key=lambda order: errors[order][0])
     if errors[best][0] < 0.25 and best != told:

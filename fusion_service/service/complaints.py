@@ -55,6 +55,7 @@ class Complaints:
         self._bytes = 0
         self._heard: dict[str, Listened] = {}
         self._doubts: dict[str, list[str]] = {}
+        self._figures: dict[str, dict[str, float]] = {}
         self._step = 0
         self._turn = 0
 
@@ -143,7 +144,7 @@ class Complaints:
             for doubt in doubts:
                 if self._bounds.allows(f"{name}: {doubt[:40]}", SELDOM):
                     self._say(f"source {name}: {doubt}")
-            self._doubts[name] = doubts
+            self._doubts[name], self._figures[name] = doubts, _figures(one)
         self._turn += AT_ONCE
 
     def told(self, sources: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
@@ -152,6 +153,9 @@ class Complaints:
         for name, last in list(self._last.items()):
             if name in out or len(out) < MOST_NAMED:
                 out[name] = {**out.get(name, {}), "last_refusal": dict(last)}
+        for name, figures in list(self._figures.items()):
+            if name in out:
+                out[name] = {**out[name], **figures}
         for name, doubts in list(self._doubts.items()):
             if doubts and (name in out or len(out) < MOST_NAMED):
                 out[name] = {**out.get(name, {}), "doubts": list(doubts)}
@@ -198,3 +202,10 @@ class Complaints:
             if self._bounds.allows(f"complaint {place}", 1.0):
                 log.warning("%s", line)
                 return
+
+
+def _figures(one: Listened) -> dict[str, float]:
+    """Messages with tracks a second, the period that it declares, and by how much its clock is ahead, s."""
+    declared = None if one.info is None else one.info.period
+    said = {"rate": one.rate, "declared_period": declared, "clock": one.clock}
+    return {key: value for key, value in said.items() if value is not None}
