@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import msgpack
 
-from fusion_service.bus import Inbox, open_bus
+from fusion_service.bus import Bus, BusError, Inbox, open_bus
 from fusion_service.bus.security import maybe_security
 from fusion_service.errors import HealthError, UsageError
 from fusion_service.hints import Listened
 from fusion_service.hints.inspecting import inspect
 from fusion_service.hints.payload import raw_map
 from fusion_service.hints.showing import shown
-from schemas import MessageError, SensorInfo, Status, decode
+from schemas import MessageError, SensorInfo, Status, decode, global_key, local_key
 
 __all__ = ["check_file", "check_source"]
 
@@ -142,6 +144,22 @@ class _Check:
         return lines or ["no centre is there"]
 
 
+def _hear(bus: Bus, name: str, realm: str, take: Callable[[str, bytes], None], alive: dict[str, bool]) -> None:
+    """Hear all of the bus; where a certificate does not let us, the source and the centres in `realm` alone."""
+    try:
+        bus.subscribe("**", take)
+        bus.watch("**/v1/local/*/alive", alive.__setitem__)
+    except BusError:
+        try:
+            for what in ("tracks", "intensity", "info"):
+                bus.subscribe(local_key(name, what, realm), take)
+            bus.watch(local_key(name, "alive", realm), alive.__setitem__)
+        except ValueError as error:
+            raise UsageError(str(error)) from None
+        with suppress(BusError):
+            bus.subscribe(global_key("*", "status", realm), take)
+
+
 def check_source(
     name: str, connect: str, realm: str, seconds: float, security: Path | None, stop: threading.Event
 ) -> None:
@@ -151,8 +169,7 @@ def check_source(
     check = _Check(name, realm)
     alive: dict[str, bool] = {}
     with open_bus([connect], wait=HUB, stop=stop, security=maybe_security(security)) as bus:
-        bus.subscribe("**", lambda key, data: inbox.put(key, (key, data, time.time_ns()), len(data)))
-        bus.watch("**/alive", alive.__setitem__)
+        _hear(bus, name, realm, lambda key, data: inbox.put(key, (key, data, time.time_ns()), len(data)), alive)
         begin = time.monotonic()
         while not stop.is_set() and time.monotonic() - begin < seconds:
             for _, (key, data, received) in inbox.take(0.1):

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fusion_service import __version__
 from fusion_service.bus import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.errors import UsageError
-from fusion_service.process import argument, data_folder, exit_code, positive, stop_on_signals, whole
+from fusion_service.process import Parser, argument, data_folder, exit_code, positive, stop_on_signals, whole
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
 from sensor_clients.faults import faulty, read_fault
@@ -60,12 +61,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="sensor-client",
         description="Publish the tracks of one simulated or recorded sensor, or the truth.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     simulate = _command(commands, "simulate", "simulate a sensor and its local tracker", EXAMPLES)
     simulate.add_argument("scenario", help="three-radars")

@@ -70,7 +70,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     now = time.time_ns()
     healths = [health_of(status, ear.pictures.get(name), now) for name, status in sorted(ear.statuses.items())]
     beside = ear.beside(args.realm)
-    wrong = [line for health in healths for line in health.wrong] + beside
+    wrong = [*ear.twice(), *(line for health in healths for line in health.wrong), *beside]
     if not healths:
         who = f"no centre named {args.centre}" if args.centre else f"no centre of the realm {args.realm}"
         wrong.insert(0, f"{who} answers: is `fusion-service run` there, under this name?")
@@ -80,6 +80,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     else:
         for health in healths:
             print("\n".join(health.lines))
+        for line in ear.twice():
+            print(line)
         for line in beside:
             print(f"beside: {line}")
         if not everywhere:
@@ -94,6 +96,7 @@ class _Ear:
     def __init__(self) -> None:
         self.statuses: dict[str, Any] = {}
         self.pictures: dict[str, Any] = {}
+        self._runs: dict[str, dict[int, int]] = {}
         self._keys: dict[str, None] = {}
 
     def take(self, key: str, data: bytes) -> None:
@@ -106,8 +109,18 @@ class _Ear:
             return
         if isinstance(message, Status):
             self.statuses[message.source] = message
+            runs = self._runs.setdefault(message.source, {})
+            runs[message.epoch] = runs.get(message.epoch, 0) + 1
         elif isinstance(message, GlobalTracks) and not message.delta:
             self.pictures[message.source] = message
+
+    def twice(self) -> list[str]:
+        """Centres of which two processes publish at once."""
+        return [
+            f"{len(runs)} processes publish as centre {name}: end one of them, or let it stand by (run --standby)"
+            for name, runs in sorted(self._runs.items())
+            if sum(count > 1 for count in runs.values()) > 1
+        ]
 
     def overhear(self, bus: Any) -> bool:
         """Hear on which keys anybody publishes; whether that is allowed."""

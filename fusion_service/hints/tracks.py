@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -69,6 +70,7 @@ def glimpse(message: LocalTracks | LocalIntensity) -> Glimpse:
     )
 
 
+@lru_cache(maxsize=1024)
 def frame_doubt(frame: Enu, picture: Enu) -> str:
     """A frame whose origin is far from that of the picture, where another reading of it is not."""
     away = _apart(frame, picture)

@@ -28,7 +28,9 @@ MOST_WAITING, MOST_BYTES = 4096, 2**25
 AGAIN = 1.0
 """Seconds in which the same refusal of the same source is counted, not explained again."""
 AT_ONCE = 40
-"""Sources that are thought about at a time, and refusals of a step that are explained."""
+"""Refusals of a step that are explained."""
+THINKING = 0.005
+"""Seconds at a time in which sources are looked at, one after another; the others are next."""
 LOUD, SELDOM = 10.0, 600.0
 """Seconds between two lines about the same refusal of a source, and about the same doubt."""
 BENIGN = ("repeat", "muted")
@@ -128,9 +130,10 @@ class Complaints:
 
     def think(self, alive: Mapping[str, bool], frame: Frame | None) -> None:
         """Look at some of the sources for what is doubtful. alive: by liveliness tokens; frame: of the picture."""
-        now, names = time.time_ns(), list(self._heard)
-        for place in range(min(AT_ONCE, len(names))):
-            name = names[(self._turn + place) % len(names)]
+        now, names, begin = time.time_ns(), list(self._heard), time.perf_counter()
+        for _ in names:
+            name = names[self._turn % len(names)]
+            self._turn += 1
             one = self._heard[name]
             try:
                 doubts = one.doubts(now, frame)
@@ -145,7 +148,8 @@ class Complaints:
                 if self._bounds.allows(f"{name}: {doubt[:40]}", SELDOM):
                     self._say(f"source {name}: {doubt}")
             self._doubts[name], self._figures[name] = doubts, _figures(one)
-        self._turn += AT_ONCE
+            if time.perf_counter() - begin > THINKING:
+                break
 
     def told(self, sources: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
         """What is said of sources in a status, with their last refusals and what is doubtful. On any thread."""

@@ -17,6 +17,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
+from fusion_service import __version__
 from fusion_service.bus import Bus, Inbox, open_bus
 from fusion_service.bus.security import check_party, maybe_security
 from fusion_service.centre import (
@@ -91,6 +92,9 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
     security = maybe_security(config.bus.security)
     if security is not None:
         check_party(security, ("centre",), config.centre.name)
+    hub, folder = ", ".join(config.bus.connect), config.service.state or "nowhere"
+    words = "fusion-service %s: centre %s of realm %s, at the hub %s, state kept in %s"
+    log.info(words, __version__, config.centre.name, config.bus.realm, hub, folder)
     with open_state(config.service.state) as state:
         join = partial(open_bus, config.bus.connect, stop=stop, security=security)
         succeed(config, state, stop, join, Service, standby)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -11,6 +12,8 @@ from pathlib import Path
 import msgpack
 import pytest
 
+import schemas
+from fusion_service import __version__
 from fusion_service.cli import main
 from tests.helpers.processes import Hub, eventually, free_endpoint
 from tests.helpers.scene import Scene, opened
@@ -59,8 +62,6 @@ def test_what_is_wrong_is_told_and_ends_with_1(scene: Scene, capsys: pytest.Capt
     late.put(msgpack.packb(message))
     eventually(lambda: scene.said_of("m01", "last_refusal"))
     beside_code = []
-    import threading
-
     stop = threading.Event()
 
     def publish() -> None:
@@ -122,3 +123,29 @@ def test_a_hub_that_is_not_there_is_one_line(
     monkeypatch.setattr("fusion_service.commands.status.HUB", 0.2)
     assert main(["status", "--connect", free_endpoint()]) == 1
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_two_processes_that_publish_as_one_centre_are_told_of() -> None:
+    from fusion_service.commands.status import _Ear
+
+    ear = _Ear()
+    for seq in range(2):
+        for epoch in (1, 2):
+            status = schemas.Status(
+                source="centre", epoch=epoch, seq=seq, sent=1, time=1, step=1, uptime=1.0, rates={}, queue={},
+                refused={}, dropped={}, sources={}, tracks={}, step_time={},
+            )  # fmt: skip
+            assert ear.twice() == [] or seq == 1
+            ear.take("fusion/v1/global/centre/status", schemas.encode(status))
+    assert "2 processes publish as centre centre: end one of them" in ear.twice()[0]
+
+
+def test_a_command_that_is_nearly_right_is_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["stauts"])
+    assert ended.value.code == 2
+    assert "did you mean 'status'?" in capsys.readouterr().err
+    with pytest.raises(SystemExit) as ended:
+        main(["--version"])
+    assert ended.value.code == 0
+    assert capsys.readouterr().out == f"fusion-service {__version__}\n"
