@@ -20,6 +20,7 @@ __all__ = [
     "WHAT",
     "LocalId",
     "Order",
+    "giver_of",
     "order_event",
     "order_of",
     "read_order",
@@ -95,8 +96,9 @@ class Order:
     source: whom mute, unmute, quarantine, release, drop and supervise are about. track: the global id it is about;
     other: a second one (merge: the one that ends). local: a local track; against: a second one (never-link). name,
     shown, identity: what rename and identify give. state: what supervise settles, one of `STATES` or auto. number: the
-    order's own (withdraw: that of another), 0 lets the centre count. who gave it, why, until when it stands (ns; None:
-    until what it is about ends). refused: why it was refused before it came to the centre, which then only logs it.
+    order's own (withdraw: that of another), 0 lets the centre count. who gave it, as it says, or, where `proven`, as a
+    certificate does; why, until when it stands (ns; None: until what it is about ends). refused: why it was refused
+    before it came to the centre, which then only logs it.
     """
 
     what: str
@@ -115,11 +117,22 @@ class Order:
     number: int = 0
     state: str = ""
     refused: str = ""
+    proven: bool = False
+
+    @property
+    def giver(self) -> str:
+        """Who gave it, and whether that is only said."""
+        return giver_of(self.who, self.proven)
 
     def stripped(self) -> Order:
         """Without what an order of this kind is not about, as it stands."""
-        about = {name: getattr(self, name) for name in (*ABOUT[self.what], "who", "why", "until", "number")}
+        about = {name: getattr(self, name) for name in (*ABOUT[self.what], "who", "proven", "why", "until", "number")}
         return Order(self.what, **about)
+
+
+def giver_of(who: str, proven: bool) -> str:
+    """Who gave an order, for people."""
+    return who if proven else f"{who} (unproven)" if who else "?"
 
 
 _DEFAULTS = {one.name: one.default for one in fields(Order) if one.name not in ("what", "source", "track")}
@@ -168,6 +181,12 @@ def _text(value: Any) -> str:
     return value.strip()
 
 
+def _flag(value: Any) -> bool:
+    if type(value) is not bool:
+        raise ValueError("must be true or false")
+    return value
+
+
 def _whole(top: int) -> Any:
     def read(value: Any) -> int:
         if isinstance(value, str) and _INT.match(value):
@@ -194,4 +213,5 @@ _READERS: dict[str, Any] = {
     **dict.fromkeys(("until", "withdrawn"), _whole(2**63)),
     "number": _whole(MOST_NUMBER),
     "shown": _whole(2**32),
+    "proven": _flag,
 }

@@ -43,7 +43,7 @@ SECTIONS = {
             "platforms",
             "extent",
         ),
-        *("tracklets", "late", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
+        *("tracklets", "late", "outages", "motion", "rules", "mixtures", "partial", "review", "docker", "wire"),
     ],
     "How good, how fast": ["measurements", "worlds", "studies", "performance", "rules-speed", "reliability"],
     "API": ["api/*"],

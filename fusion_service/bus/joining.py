@@ -107,7 +107,7 @@ def join(
 class _Attempts:
     """A client's attempts to join its hub, on a thread: until one succeeds, or nobody waits any more.
 
-    why: what is known of why the last one failed."""
+    why: what is known of why the last one failed, empty where no hub is there."""
 
     def __init__(self, connect: Sequence[str], again: bool, security: Security | None) -> None:
         self.ended = threading.Event()
@@ -133,7 +133,7 @@ class _Attempts:
             elif not self._again:
                 break
             else:
-                self._abandoned.wait(RETRY)
+                self._abandoned.wait(FIRST if self.why else RETRY)  # whom a hub refuses fills its log with each try
         self.ended.set()
 
     def _attempt(self) -> tuple[Any, Mapping[str, Sequence[str]] | None] | None:

@@ -243,6 +243,38 @@ class Bus:
         with self._may("publish", key_expression):
             return Declaration(self, [self._session.declare_queryable(key_expression, guard.wrap(reply))], guard)
 
+    def answer_later(
+        self,
+        key_expression: str,
+        handler: Callable[[str, bytes | None, Callable[[bytes | Exception], None]], None],
+    ) -> Declaration:
+        """The same where an answer may take its time: `handler(key, payload, reply)` returns at once, and from any
+        thread `reply` is called with the answer, or with what is wrong, once."""
+        guard = _Guard(key_expression)
+
+        def take(query: Any) -> None:
+            asked = str(query.key_expr)
+            key = asked if "*" in key_expression else key_expression
+
+            def reply(answer: bytes | Exception) -> None:
+                try:
+                    with query:
+                        if isinstance(answer, Exception):
+                            query.reply_err(str(answer) or type(answer).__name__)
+                        else:
+                            query.reply(key, answer)
+                except zenoh.ZError as error:  # who asked is gone, or the session
+                    log.warning("%s: cannot answer: %s", key, reason(error))
+
+            try:
+                handler(asked, None if query.payload is None else bytes(query.payload), reply)
+            except Exception as error:
+                reply(error)
+                raise
+
+        with self._may("publish", key_expression):
+            return Declaration(self, [self._session.declare_queryable(key_expression, guard.wrap(take))], guard)
+
     def ask(self, key: str, payload: bytes | None = None, timeout: float = 1.0) -> list[tuple[str, bytes]]:
         """Ask everyone who answers on `key` (an expression may reach several): (key, data) of each answer,
         none if nobody is there. Raises `BusError` if all that came are errors or `timeout` seconds have passed.

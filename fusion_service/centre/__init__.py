@@ -2,7 +2,7 @@
 
 from fusion_service.centre.arrival import ArrivalClock
 from fusion_service.centre.centre import Centre, StepResult
-from fusion_service.centre.checkpoint import CheckpointError
+from fusion_service.centre.checkpoint import CheckpointError, Glance, glance
 from fusion_service.centre.clock import MessageClock, WallClock
 from fusion_service.centre.era import ClockSet, NewEra
 from fusion_service.centre.events import Event, Refused, Skipped, SourceFound, SourceLost
@@ -10,6 +10,7 @@ from fusion_service.centre.fusion import FusionCentre
 from fusion_service.centre.intensity import IntensityCentre
 from fusion_service.centre.judging import Outcome, View, judge
 from fusion_service.centre.making import make_centre
+from fusion_service.centre.naming import LocalKey
 from fusion_service.centre.pictures import is_picture_of, source_of
 from fusion_service.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
 
@@ -22,8 +23,10 @@ __all__ = [
     "ClockSet",
     "Event",
     "FusionCentre",
+    "Glance",
     "IntensityCentre",
     "LocalId",
+    "LocalKey",
     "MessageClock",
     "NewEra",
     "Order",
@@ -35,6 +38,7 @@ __all__ = [
     "StepResult",
     "View",
     "WallClock",
+    "glance",
     "is_picture_of",
     "judge",
     "make_centre",

@@ -32,7 +32,7 @@ from fusion_service.densities import Mixtures
 from fusion_service.records import altered
 from schemas import Entry, Frame, Motion
 
-__all__ = ["predict_tracks", "usable_rows", "write_back"]
+__all__ = ["PARTS", "predict_tracks", "usable_rows", "write_back"]
 
 KEPT = 4096
 """Rows up to which columns that say something of sources are kept."""
@@ -101,7 +101,7 @@ def _used(intake: Intake, time: int) -> list[_Used]:
     room = MAX_TOTAL // max(len(intake.sources), 1)
     for number, (name, source) in enumerate(sorted(intake.sources.items())):
         said = intake.declared(source)
-        table = retire(source, said, time, room, intake.config)
+        table = retire(source, said, time, room, intake.config, intake.spared.awake)
         if source.muted or not intake.ready(source):
             leave_out(source)
         else:

@@ -28,14 +28,14 @@ class ArrivalClock:
     comes there is no step.
     """
 
-    def __init__(self, config: CentreConfig) -> None:
+    def __init__(self, config: CentreConfig, authenticated: bool = False) -> None:
         self._config = config
         self._spacing = round(config.arrival_spacing * 1e9)
         self._lateness = round(config.lateness * 1e9)
         self._period = round(config.period * 1e9)
         self._back = round((config.delay + config.period) * 1e9)
         self._margin = margin(config)
-        self._messages = MessageClock(config) if config.clock == "message" else None
+        self._messages = MessageClock(config, authenticated) if config.clock == "message" else None
         self._grid = WallClock(config)
         self._waiting: list[int] = []
         self._free = -1
@@ -71,7 +71,7 @@ class ArrivalClock:
                 return grid
             self._held, self._until = grid, now + (self._period // 2 if last > grid - self._period else 0)
         if not self._free - self._spacing <= now < self._free:
-            newest = self._newest(now if self._messages is None else None)
+            newest = self._newest(now if self._messages is None else self._messages.limit())
             if newest is not None and (at := self._step_for(newest, last)) is not None:
                 self._free = now + self._spacing
                 return at
@@ -86,7 +86,8 @@ class ArrivalClock:
 
     def wait(self, now: int) -> float:
         """Seconds until a step may be due without anything new; infinite where none will be."""
-        at = max(self._waiting[0], self._free) if self._waiting else None
+        waits = self._waiting and (self._messages is None or self._waiting[0] <= self._messages.limit())
+        at = max(self._waiting[0], self._free) if waits else None
         until = float("inf") if at is None else max(0.0, (at - now) / 1e9)
         if self._held >= 0:
             until = min(until, max(0.0, (self._until - now) / 1e9))
@@ -98,10 +99,10 @@ class ArrivalClock:
         while self._messages.due() is not None:
             pass
 
-    def _newest(self, now: int | None) -> int | None:
-        """The newest of the scans that wait, which wait no more; None for none. now: only those until then."""
+    def _newest(self, now: int) -> int | None:
+        """The newest of the scans that wait and hold until `now`, which wait no more; None for none."""
         newest = None
-        while self._waiting and (now is None or self._waiting[0] <= now):
+        while self._waiting and self._waiting[0] <= now:
             newest = heapq.heappop(self._waiting)
         return newest
 

@@ -31,7 +31,7 @@ from fusion_service.centre.journal import Journal, start_event
 from fusion_service.centre.judging import View
 from fusion_service.centre.labels import Labels
 from fusion_service.centre.lifecycle import empty_picture
-from fusion_service.centre.naming import Book
+from fusion_service.centre.naming import Book, LocalKey
 from fusion_service.centre.obeying import heirs, obey, view_of
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.publishing import Contributions, picture_message
@@ -95,6 +95,7 @@ class Centre(ABC):
             state, self._picture = unpack_state(checkpoint, self._intake, self._labels)
             self._step, self._time, self._ids.next = state["step"], state["time"], state["next_id"]
             self._era.unpack(state["era"])
+            self._ids.promised.restore(state["promised"])
             try:
                 if state["own"] is not None:
                     self._restore(state["own"])
@@ -118,7 +119,7 @@ class Centre(ABC):
         if isinstance(event, Skipped):
             self._journal.event({"kind": "skipped", "steps": event.steps})
             self._history.behind()
-        elif not isinstance(event, (ClockSet, NewEra)):
+        if not isinstance(event, (ClockSet, NewEra)):
             self._intake.put(event, received)
             self._history.note(event, received)
 
@@ -165,7 +166,7 @@ class Centre(ABC):
         past = self._begin_step(time, self._history.noted() if events is None else events, left)
         journal = self._journal
         self._obey(self._intake.take_orders(), time)
-        rest(self._intake, self._time, journal)
+        rest(self._intake, self._time, journal, self._picture.id)
         self._forget_lineages()
         told = len(journal.taken())  # of what was late
         self._intake.admit(time, self._time, journal)
@@ -184,6 +185,8 @@ class Centre(ABC):
         self._other = {}
         self._intake.orders.follow(gone_on)
         self._labels.follow(rows, self._picture, names, gone_on, time, journal)
+        for track in self._ids.promised.settle(self._picture.id, time):
+            journal.end(track, "lost", None)
         return contributions
 
     def _begin_step(self, time: int, events: tuple[tuple[Event, int], ...], left: int) -> Past:
@@ -208,7 +211,8 @@ class Centre(ABC):
         start = self._history.start(late) if self._history.on else None
         if start is None:
             return None
-        revision = Revision(self._history, start, late, self._intake, self._picture.id, self._ids.next)
+        ids = self._ids.known(self._picture.id)
+        revision = Revision(self._history, start, late, self._intake, ids, self._ids.next)
         own, queue = self._journal, revision.left(self._intake.emptied())
         self._go_back(revision)
         for place, past in enumerate(revision.steps):
@@ -223,7 +227,11 @@ class Centre(ABC):
         if self._ids.book is not None:
             there = revision.there.union(one for one in self._picture.id.tolist() if one >= revision.following)
             self._go_on_as(self._ids.book.done(self._picture.id.tolist(), there, self._ids.fresh))
-        return revision.tell(own, self._intake, self._picture.id, self._other)
+            waiting = self._ids.known(self._picture.id[:0])
+            over = waiting[(waiting < revision.following) & ~np.isin(waiting, ids)]
+            self._stop_waiting(over)
+            self._ids.promised.drop(over.tolist())
+        return revision.tell(own, self._intake, self._ids.known(self._picture.id), self._other)
 
     def _go_on_as(self, new: dict[int, int]) -> None:
         """Tracks that have ended, and are there after all, take other ids: {old: new}."""
@@ -240,11 +248,12 @@ class Centre(ABC):
             self._ids.book.again(revision.steps[0].number - 1, revision.tables, revision.there)
         state = revision.steps[0].state
         self._intake = Intake(self.config)
-        self._intake.spared = copy(revision.steps[0].spared)
+        self._intake.spared = revision.steps[0].spared.rested()
         self._labels = Labels(self._intake)
         self._begin()
         kept, self._picture = unpack_state(state or b"", self._intake, self._labels)
         self._step, self._time = kept["step"], kept["time"]
+        self._ids.promised.restore(kept["promised"])
         self._restore(kept["own"])
         self._state = state
 
@@ -265,9 +274,16 @@ class Centre(ABC):
         """Forget global tracks that have ended since the checkpoint that this centre was made from; how many it had."""
         gone = np.isin(self._picture.id, tracks)
         self._forget(self._picture.id[gone].tolist())
+        self._ids.promised.drop(tracks.tolist())
         self._picture = self._picture.take(~gone)
         self._state = None
-        return int(gone.sum())
+        return int(gone.sum()) + self._stop_waiting(tracks)
+
+    def promise(self, born: Iterable[tuple[LocalKey, int]]) -> None:
+        """Ids that were published for these local tracks since the checkpoint that this centre was made from: tracks
+        that they begin take them."""
+        self._ids.promised.add(born)
+        self._state = None
 
     def checkpoint(self) -> bytes:
         """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""
@@ -277,6 +293,7 @@ class Centre(ABC):
             "time": self._time,
             "next_id": self._ids.next,
             "era": self._era.pack(),
+            "promised": self._ids.promised.packed(),
             "own": self._kept(),
         }
         self._state = pack_state(self.config_hash, state, self._intake, self._labels, self._picture)
@@ -320,6 +337,10 @@ class Centre(ABC):
         """What the status says of sources, by name, beside what every kind of centre says."""
         return {}
 
+    def _stop_waiting(self, tracks: NDArray[np.uint64]) -> int:
+        """Suspended tracks that do not come back; how many of them there were."""
+        return 0
+
     @abstractmethod
     def _forget(self, tracks: Iterable[int]) -> None:
         """Undo whatever refers to global tracks that are no more."""
@@ -349,4 +370,5 @@ class Centre(ABC):
     def _numbers(self) -> dict[str, int]:
         kinds = np.bincount(self._picture.status, minlength=len(messages.STATUSES)).tolist()
         counts = {name: kinds[code] for code, name in enumerate(messages.STATUSES)}
+        counts |= {"suspended": len(self._ids.waiting)} if len(self._ids.waiting) else {}
         return counts | self._labels.numbers()

@@ -5,7 +5,7 @@ It holds sources with their sequence positions, orders, links and tracks, the gl
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgpack
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from fusion_service.centre.intake import Intake
     from fusion_service.centre.labels import Labels
 
-__all__ = ["CHECKPOINT_VERSION", "CheckpointError", "pack_state", "unpack_state"]
+__all__ = ["CHECKPOINT_VERSION", "CheckpointError", "Glance", "glance", "pack_state", "unpack_state"]
 
 CHECKPOINT_VERSION = 2
 READABLE = (1, 2)
@@ -55,6 +55,7 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: 
         "labels": labels.kept(),
         "said": [words.texts for words in intake.said],
         "lineages": intake.lineages.kept(),
+        "awake": intake.spared.awake,
         **state,
     }
     return cast(bytes, msgpack.packb(whole))
@@ -84,9 +85,28 @@ def unpack_state(blob: bytes, intake: Intake, labels: Labels) -> tuple[dict[str,
     except Exception as error:
         raise CheckpointError(f"the checkpoint cannot be read: {type(error).__name__}: {error}") from None
     intake.frame, intake.sources, intake.voting.asked = intake.config.frame or frame, sources, asked
+    intake.spared.awake = int(whole.get("awake", -1))
     intake.resting = resting
     intake.mute()
-    return {**numbers, "era": era, "own": whole.get("own")}, picture
+    promised = whole.get("promised", {"since": -1, "ids": []})
+    return {**numbers, "era": era, "own": whole.get("own"), "promised": promised}, picture
+
+
+class Glance(NamedTuple):
+    """Of a checkpoint: the time of its step, ns, -1 before the first, and the generation of the newest id given."""
+
+    time: int
+    generation: int
+
+
+def glance(blob: bytes) -> Glance:
+    """What a checkpoint says at a glance; (-1, 0) of one that cannot be read."""
+    try:
+        whole = msgpack.unpackb(blob)
+        time, following = int(whole["time"]), int(whole["next_id"])
+    except Exception:
+        return Glance(-1, 0)
+    return Glance(time, following >> 32) if 0 <= following < 2**64 else Glance(-1, 0)
 
 
 def _restore_words(whole: dict[str, Any], sources: dict[str, Source], intake: Intake, labels: Labels) -> None:

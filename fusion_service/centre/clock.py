@@ -6,6 +6,7 @@ import heapq
 from dataclasses import dataclass
 
 from fusion_service.centre.pictures import is_picture_of, source_of
+from fusion_service.centre.votes import Voter, Voting, bound, first_pace, is_silent, named
 from fusion_service.config import CentreConfig
 from schemas import GlobalTracks, LocalIntensity, LocalTracks
 
@@ -54,28 +55,26 @@ class WallClock:
 
 
 @dataclass(slots=True)
-class _Source:
-    """What is known of a source, times in ns, -1 for never.
+class _Source(Voter):
+    """What is known of a source beside its vote, times in ns, -1 for never.
 
-    epoch: its run. claimed: the newest time it said in this run, and newest: that of those which were followed.
-    token: whether its token is there; None if it never had one. Of one too far ahead: refused, the newest time
-    that was; waited, how long it has gone on by its own count while the median stood at `median`.
-    centre: it is another centre.
+    epoch: its run. newest: the newest time it said in this run that was followed. Of one too far ahead: refused, the
+    newest time that was; waited, how long it has gone on by its own count while the median stood at `median`.
     """
 
     epoch: int = -1
-    claimed: int = -1
     newest: int = -1
-    token: bool | None = None
     refused: int = -1
     waited: int = 0
     median: int = -1
-    centre: bool = False
 
 
 class MessageClock:
-    """Steps at t = k * period when every live source has reached t, or the newest message is more than
-    `lateness` past it.
+    """Steps at t = k * period when every live source has reached t, or the newest message, as far as it is followed, is
+    more than `lateness` past it.
+
+    It is followed as far as the votes of the sources allow (`votes`), whoever is further ahead; who has no vote while
+    others have is not waited for, and what it says moves nothing.
 
     A source is live while its token is there, or, if it never had one, while its messages keep up. Where sources
     disagree about the time by more than the lead (`LEAD` seconds, `lateness` and ten periods), the median of what
@@ -84,9 +83,9 @@ class MessageClock:
     whether one is far ahead or far behind; of two nobody can tell which is wrong, and the earlier one is
     followed, since a step too far cannot be taken back. But steps go on: when the refused one has gone on for
     the lead by its own count (of which a single message makes up a tenth at most), and the median has not
-    moved by one period in that time, it is followed. Who is behind the clock by more than one and a half
-    leads has no vote, and the clock waits for nobody who is behind by more than one, or
-    was refused last.
+    moved by one period in that time, it is followed. Who is behind the clock by more than half the
+    lead has no say in that, and the clock waits for nobody who is behind by more than the lead, was refused last, is
+    silent, or is so far behind that its next message will be too late.
 
     What is too late for the newest step is for the centre to refuse, in the next step; but where nothing else comes
     there is none, so that it is refused at once (`observe`). Where that has gone on for the lead, time was set back
@@ -96,7 +95,8 @@ class MessageClock:
     for the other.
 
     Spans without any message are skipped. At most `MAX_NAMES` sources are known: beyond, a tenth of them is
-    forgotten, those without a token first, the longest silent among them.
+    forgotten, those without a token first, the longest silent among them, those named in the config last.
+    authenticated: certificates say who is who, so that all have a vote.
     """
 
     LEAD = 60.0
@@ -104,11 +104,17 @@ class MessageClock:
     FEW = 3
     MAX_NAMES = 1000
 
-    def __init__(self, config: CentreConfig) -> None:
+    def __init__(self, config: CentreConfig, authenticated: bool = False) -> None:
         self._config = config
         self._period = round(config.period * 1e9)
         self._lateness = round(config.lateness * 1e9)
         self._lead = round(self.LEAD * 1e9) + self._lateness + 10 * self._period
+        self._named = None if authenticated else named(config)
+        self._voting = Voting(self._lead, self._lateness, self._period, not authenticated and self._named is None)
+        self._now = 0
+        """Time of reception that has passed, ns: between two messages at most the lead."""
+        self._received = -1
+        self._bound = -1
         self._next: int | None = None
         self._sources: dict[str, _Source] = {}
         self._front = -1
@@ -128,27 +134,34 @@ class MessageClock:
         if max(message.time, message.epoch) > horizon(received, self._config):
             return "future"
         late = self._is_late(message.time)
-        return "" if self.observe(source_of(message), message.epoch, message.time) else "late" if late else "future"
+        taken = self.observe(source_of(message), message.epoch, message.time, received)
+        return "" if taken else "late" if late else "future"
 
-    def observe(self, source: str, epoch: int, time: int) -> bool:
-        """A message of this run of `source` holds at `time`, ns. False: refuse it, as too far ahead of the others, or
-        as too late where `FEW` before it were so, and none was not."""
+    def observe(self, source: str, epoch: int, time: int, received: int | None = None) -> bool:
+        """A message of this run of `source` holds at `time`, ns, and came at `received` (None: as fast as its own time
+        goes). False: refuse it, as too far ahead of the others, or as too late where `FEW` before it were so, and none
+        was not."""
         one = self._source(source)
         if epoch > one.epoch:
             known = one.claimed >= 0
-            one.epoch, one.claimed, one.newest, one.refused = epoch, -1, -1, -1
+            one.restart()
+            one.epoch, one.newest, one.refused = epoch, -1, -1
             if known:
                 self._look_again()
+        self._pass(one, time, received)
+        if not self._has_a_say(source):
+            one.says(time, self._now, self._bound, self._voting)
+            return self._take_beside(one, time)
         if not self._is_late(time):
             self._late = 0
         elif not self._is_set_back(time):
             self._late += 1
-        one.claimed = max(time, one.claimed)
+        one.says(time, self._now, self._bound, self._voting)
         self._reference = min(self._reference, one.claimed)
         if time > self._reference + self._lead:
             median = self._median(one)
             self._reference = median if self._is_live(one, one.claimed) else -1
-            if time > median + self._lead and not self._has_waited(one, time, median):
+            if time > median + self._lead and not (self._goes_on(one, time) or self._has_waited(one, time, median)):
                 return False
         one.refused = -1
         one.newest = max(time, one.newest)
@@ -159,8 +172,46 @@ class MessageClock:
 
     def presence(self, source: str, alive: bool) -> None:
         """The token of `source` came or went."""
-        self._source(source).token = alive
+        one = self._source(source)
+        one.token = alive
+        if one.claimed < 0:
+            one.heard, one.pace = self._now, first_pace(self._voting)
         self._reference = -1
+
+    def limit(self) -> int:
+        """The latest time, ns, to which the sources let the clock go; -1 before any message."""
+        allowed = self._allowed()
+        return self._front if allowed is None else min(self._front, allowed)
+
+    def _allowed(self) -> int | None:
+        return bound(self._voters(), self._now, self._bound, self._voting)
+
+    def _voters(self) -> list[_Source]:
+        """Those named, where one of them speaks; else all."""
+        known = [self._sources[name] for name in self._named or () if name in self._sources]
+        speak = any(one.claimed >= 0 and one.token is not False and not is_silent(one, self._now) for one in known)
+        return known if speak else list(self._sources.values())
+
+    def _pass(self, one: _Source, time: int, received: int | None) -> None:
+        """Let time of reception pass until this message of `one`."""
+        if received is None:
+            self._now += min(max(time - one.claimed, 0), self._period) if one.claimed >= 0 else 0
+        else:
+            self._now += min(max(received - self._received, 0), self._lead) if self._received >= 0 else 0
+            self._received = received
+
+    def _has_a_say(self, source: str) -> bool:
+        """Whether it has a vote, or none of those speaks who alone should."""
+        return self._named is None or source in self._named or len(self._voters()) == len(self._sources)
+
+    def _take_beside(self, one: _Source, time: int) -> bool:
+        """A message of who has no say: it is taken unless it is too far ahead of the clock."""
+        if time > self._front + self._lead:
+            return False
+        one.refused, one.newest = -1, max(time, one.newest)
+        if self._next is None or time > self._next - self._period:
+            self._wait_for(time)
+        return True
 
     def _is_late(self, time: int) -> bool:
         """Whether the step for what holds at `time` was made long ago."""
@@ -176,15 +227,17 @@ class MessageClock:
         if self._late_waited < self._lead:
             return False
         for one in self._sources.values():
-            one.claimed = one.newest = one.refused = -1
-        self._next, self._front, self._reference, self._late = None, -1, -1, 0
+            one.restart()
+            one.newest = one.refused = -1
+        self._next, self._front, self._reference, self._late, self._bound = None, -1, -1, 0, -1
         self._times, self._waiting = [], set()
         return True
 
     def _source(self, name: str) -> _Source:
         if name not in self._sources:
             if len(self._sources) >= self.MAX_NAMES:
-                unheld = [known for known, one in self._sources.items() if not one.token] or list(self._sources)
+                free = [known for known in self._sources if known not in (self._named or ())] or list(self._sources)
+                unheld = [known for known in free if not self._sources[known].token] or free
                 for known in heapq.nsmallest(self.MAX_NAMES // 10, unheld, key=lambda it: self._sources[it].newest):
                     del self._sources[known]
                 self._look_again()
@@ -198,14 +251,24 @@ class MessageClock:
     def _is_live(self, one: _Source, newest: int) -> bool:
         return newest >= self._front - self._lateness - self._period if one.token is None else one.token
 
-    def _median(self, asking: _Source) -> int:
+    def _median(self, asking: _Source, awake: bool = False) -> int:
+        """The earlier median of what the live sources claim that have a vote; awake: but those that are silent."""
+        base = self._bound if self._bound >= 0 else self._front - self._lead
         claims = sorted(
             one.claimed
-            for one in self._sources.values()
+            for one in self._voters()
             if one is asking
-            or (one.claimed >= max(0, self._front - self._lead * 3 // 2) and self._is_live(one, one.claimed))
+            or (
+                one.claimed >= max(0, base - self._lead // 2)
+                and self._is_live(one, one.claimed)
+                and not (awake and is_silent(one, self._now))
+            )
         )
         return claims[(len(claims) - 1) // 2]
+
+    def _goes_on(self, one: _Source, time: int) -> bool:
+        """Whether a source that was followed goes on by small steps, while those who hold it back are silent."""
+        return one.newest >= 0 and time <= min(one.newest + self._lead // 10, self._median(one, True) + self._lead)
 
     def _has_waited(self, one: _Source, time: int, median: int) -> bool:
         """Whether a source that is too far ahead has gone on for the lead while the median did not move."""
@@ -231,18 +294,25 @@ class MessageClock:
             self._waiting.remove(heapq.heappop(self._times))
         if self._times and self._times[0] > time + self.IDLE * self._period:
             time = self._times[0] // self._period * self._period
-        if time > self._front or (self._front <= time + self._lateness and not self._reached(time)):
+        if time > self._front or (self._front <= time + self._lateness and not self._reached(time, self._front)):
+            return None
+        allowed = self._allowed()
+        self._bound = max(self._bound, -1 if allowed is None else allowed)
+        limit = self._front if allowed is None else min(self._front, allowed)
+        if time > limit or (limit <= time + self._lateness and not self._reached(time, limit)):
             return None
         self._next = time + self._period
         return time
 
-    def _reached(self, time: int) -> bool:
-        """Whether everybody who is waited for has said `time`."""
+    def _reached(self, time: int, limit: int) -> bool:
+        """Whether everybody who is waited for has said `time`, of a clock that may go until `limit`."""
         centres = False
-        for one in self._sources.values():
-            if not self._is_live(one, one.newest):
+        for one in self._voters():
+            if one.newest >= time or one.refused >= 0 or not self._is_live(one, one.newest):
                 continue
-            if one.newest >= time or one.refused >= 0 or 0 <= one.newest < self._front - self._lead:
+            if 0 <= one.newest < max(limit - self._lead, time - self._lateness - max(one.gap, self._period)):
+                continue
+            if is_silent(one, self._now):
                 continue
             if not one.centre:
                 return False

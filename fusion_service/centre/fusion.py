@@ -23,6 +23,7 @@ from fusion_service.centre.memory import Memory
 from fusion_service.centre.publishing import Contributions, live_on
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.supervision import Supervisor
+from fusion_service.centre.suspended import Suspended
 from fusion_service.centre.tracks import relinked
 from fusion_service.config import CentreConfig
 from fusion_service.records import altered
@@ -50,6 +51,7 @@ class FusionCentre(Centre):
         self._blobs = Blobs(self.config)
         self._memory = Memory(self._intake)
         self._supervisor = Supervisor(self._intake)
+        self._suspended = Suspended.nothing(len(self.config.space))
         self._last = -1
 
     def _kept(self) -> dict[str, Any]:
@@ -59,6 +61,7 @@ class FusionCentre(Centre):
             "memory": self._memory.packed(),
             "supervision": self._supervisor.packed(),
             "blobs": self._blobs.packed(),
+            "suspended": self._suspended.packed(),
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
@@ -69,6 +72,9 @@ class FusionCentre(Centre):
         if "memory" in state:
             self._memory.restore(state["memory"])
         self._supervisor.restore(state.get("supervision", {}))
+        if "suspended" in state:
+            self._suspended = Suspended.unpacked(state["suspended"], len(self.config.space))
+        self._note_waiting()
         self._last = self._time
 
     def _rebase(self, time: int) -> None:
@@ -77,12 +83,18 @@ class FusionCentre(Centre):
         self._linker.copies.rebase(time)
         self._memory.rebase(time)
         self._supervisor.rebase(time)
+        self._suspended.rebase(time)
         self._last = min(self._last, time)
 
     def _renamed(self, new: dict[int, int]) -> None:
         self._relink(new)
 
     def _advance(self, rows: Rows, names: tuple[str, ...], time: int) -> Contributions:
+        if gap := self._intake.spared.gap:
+            self._picture = altered(self._picture, due=self._picture.due + gap)
+        self._picture = self._suspended.resume(
+            rows, names, self._picture, self._intake, self._step, time, self._linker.tests, self._journal
+        )
         now = self._associate(rows, names, time)
         self._supervisor.observe(rows, names, now, self._step, time, self._journal, self._own())
         shared = self._blobs.follow(rows, names, now, time, self._intake.frame)
@@ -111,6 +123,15 @@ class FusionCentre(Centre):
 
     def _forget(self, tracks: Iterable[int]) -> None:
         self._relink(dict.fromkeys(tracks, 0))
+
+    def _note_waiting(self) -> None:
+        self._ids.waiting = self._suspended.picture.id
+        self._intake.spared.awaited = frozenset(self._suspended.keys)
+
+    def _stop_waiting(self, tracks: NDArray[np.uint64]) -> int:
+        count = self._suspended.drop(tracks)
+        self._note_waiting()
+        return count
 
     def _relink(self, new: dict[int, int]) -> None:
         """Change the links of all tables: {old global id: new one, or 0}. A source has one track in a global one: of a
@@ -160,7 +181,12 @@ class FusionCentre(Centre):
         picture = update_existence(rows, picture, self._intake, self._entries, time, self._last, shared)
         support = self._support(rows, shared, inside, at, len(picture.id), time)
         self._last = time
-        picture, ended = live_on(picture, time, support, self.config, self._journal)
+        picture, ended, held = live_on(
+            picture, time, support, self.config, self._journal,
+            lambda ids: self._suspended.held(rows, self._intake.names(), ids, self._intake),
+        )  # fmt: skip
+        self._suspended.take(picture.take(held), self._intake, self._journal)
+        self._note_waiting()
         self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
         tracks.link[among(tracks.link, picture.id[ended])] = NO_TRACK
         self._picture = picture.take(~ended)
@@ -173,6 +199,7 @@ class FusionCentre(Centre):
         interval = rows.interval[inside]
         slack = np.maximum(interval // 2, round(self.config.period * 1e9))
         expected = rows.tracks.seen[inside] + interval + np.where(rows.lost[inside], 0, slack)
+        expected = self._intake.spared.after_waking(expected, rows.tracks.time[inside], interval + slack)
         spared = self._intake.spared.of(self._intake.names())
         if spared.any():
             expected = np.where(spared[rows.source[inside]], np.maximum(expected, time), expected)

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
-from fusion_service.centre.events import Event, SourceFound, SourceLost
+from fusion_service.centre.events import Event, Skipped, SourceFound, SourceLost
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.limits import MAX_ORDERS, MAX_SOURCES
 from fusion_service.centre.pictures import as_scan, source_of
@@ -129,7 +129,7 @@ class History:
         if isinstance(event, (SourceFound, SourceLost)):
             if event.source in self._presence or len(self._presence) < 2 * MAX_SOURCES:
                 self._presence[event.source] = event, received
-        elif isinstance(event, Order) and len(self._orders) < MAX_ORDERS:
+        elif isinstance(event, (Order, Skipped)) and len(self._orders) < MAX_ORDERS:
             self._orders.append((event, received))
 
     def noted(self) -> tuple[tuple[Event, int], ...]:

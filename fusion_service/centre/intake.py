@@ -97,7 +97,7 @@ class Intake:
         elif isinstance(event, Refused):
             self._count(event.source, event.reason, max(event.count, 1), event.dropped)
         elif isinstance(event, (ClockSet, NewEra, Skipped)):
-            return
+            self.spared.sleep(event)
         elif self._is_full(event):
             self._count(source_of(event), "pending", 1, dropped=True)
         else:
@@ -119,6 +119,7 @@ class Intake:
     def succeed(self, other: Intake) -> None:
         """Take over what is queued in `other` beside messages."""
         self._given, self._present, self._refused = other._given, other._present, other._refused
+        self.spared.slept_as(other.spared)
 
     def wake(self, name: str) -> None:
         """Something is said by, or of, a source that may rest (see `resting`): it does no more."""
@@ -155,8 +156,8 @@ class Intake:
 
     @property
     def lossy(self) -> bool:
-        """Whether data were dropped since the last step."""
-        return any(dropped for _, _, dropped in self._refused)
+        """Whether data were dropped since the last step because there was too much to do, not for one source's flow."""
+        return any(dropped and reason != "flow" for _, reason, dropped in self._refused)
 
     def names(self) -> tuple[str, ...]:
         """All sources, sorted."""
@@ -235,7 +236,7 @@ class Intake:
             self._presence(name, found, journal)
         for (name, reason, dropped), count in sorted(self._refused.items()):
             (journal.drop if dropped else journal.refuse)(Entry(name, 0, 0, 0, reason, count))
-        self.spared.note({name for name, _, dropped in self._refused if dropped}, time)
+        self.spared.note({name for name, _, dropped in self._refused if dropped}, time, last)
         self._present, self._refused, self._dead = {}, Counter(), None
         self._accept(self._due(time, journal), time, last, journal)
 

@@ -37,19 +37,21 @@ class Pace(NamedTuple):
 
 
 class Remembered(NamedTuple):
-    """R tracks that went stale, sorted by id: time of the newest report and interval, ns, (R,)."""
+    """R tracks that went stale, sorted by id: time of the newest report and interval, ns, and the global track that it
+    was linked to, 0 for none, (R,)."""
 
     id: NDArray[np.uint64]
     time: I64
     interval: I64
+    link: NDArray[np.uint64]
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Remembered:
         """The given rows."""
-        return Remembered(self.id[rows], self.time[rows], self.interval[rows])
+        return Remembered(self.id[rows], self.time[rows], self.interval[rows], self.link[rows])
 
 
 _NONE = np.zeros(0, dtype=np.int64)
-NOTHING_REMEMBERED = Remembered(np.zeros(0, dtype=np.uint64), _NONE, _NONE)
+NOTHING_REMEMBERED = Remembered(np.zeros(0, dtype=np.uint64), _NONE, _NONE, np.zeros(0, dtype=np.uint64))
 
 
 def follow(interval: int, gap: int, pace: Pace) -> int:
@@ -122,8 +124,9 @@ def remember(known: Remembered, retired: Remembered, there: NDArray[np.uint64], 
         return known
     ids = np.concatenate([known.id, retired.id])
     times, gaps = np.concatenate([known.time, retired.time]), np.concatenate([known.interval, retired.interval])
+    links = np.concatenate([known.link, retired.link])
     order = np.lexsort((times, ids))
-    both = Remembered(ids[order], times[order], gaps[order])
+    both = Remembered(ids[order], times[order], gaps[order], links[order])
     keep = np.append(both.id[1:] != both.id[:-1], True) & (both.time >= oldest) & ~np.isin(both.id, there)
     both = both.take(keep)
     if len(both.id) > most:

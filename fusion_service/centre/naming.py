@@ -111,12 +111,23 @@ class Book:
                 self.other[one] = new[one], self.step
         return new
 
-    def allot(self, whom: Sequence[Sequence[LocalKey]] | Places, fresh: Callable[[int], list[int]]) -> list[int]:
-        """An id for each group of local tracks that begins a track, or each place; fresh: gives new ones."""
+    def allot(
+        self,
+        whom: Sequence[Sequence[LocalKey]] | Places,
+        fresh: Callable[[int], list[int]],
+        known: Sequence[int | None] = (),
+    ) -> list[int]:
+        """An id for each group of local tracks that begins a track, or each place; fresh: gives new ones; known: those
+        that have one already, none where it is empty."""
         count = whom.mean.shape[1] if isinstance(whom, Places) else len(whom)
-        known: list[int | None] = [None] * count
-        if self._free:
-            known = self._nearest(whom) if isinstance(whom, Places) else self._linked(whom)
+        known = list(known) or [None] * count
+        for one in known:
+            self._free.pop(one or 0, None)
+        if isinstance(whom, Places):
+            known = self._nearest(whom) if self._free else known
+        elif self._free:
+            open_ = [group if one is None else () for group, one in zip(whom, known, strict=True)]
+            known = [two if one is None else one for one, two in zip(known, self._linked(open_), strict=True)]
         new = iter(fresh(known.count(None)))
         ids = [next(new) if one is None else one for one in known]
         for place, one in enumerate(ids):

@@ -48,7 +48,8 @@ def obey(
     """Let end what no longer stands at `time`, ns, of `step`, then obey the orders given, in the order of their
     coming."""
     hands = _Hands(intake, picture, ids, journal, time, step)
-    for one, why in intake.orders.expire(hands.view()):
+    lasting = replace(hands.view(), ids=ids.known(picture.id))
+    for one, why in intake.orders.expire(lasting):
         journal.event({"kind": "order_ended", "number": one.order.number, "what": one.order.what, "why": why})
     for order in given:
         order = intake.orders.numbered(order)

@@ -61,7 +61,9 @@ def unpack_source(name: str, packed: dict[str, Any]) -> Source:
             setattr(source, plain, packed[plain])
     if "remembered" in packed:
         kinds = NOTHING_REMEMBERED
-        columns = (from_bytes(one, like) for one, like in zip(packed["remembered"], kinds, strict=True))
+        columns = [from_bytes(one, like) for one, like in zip(packed["remembered"], kinds, strict=False)]
+        if len(columns) < len(kinds):  # of an earlier release
+            columns.append(np.zeros(len(columns[0]), dtype=np.uint64))
         source.remembered = Remembered(*columns)
     if "vote" in packed:
         spoken, names, time = packed["vote"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -40,16 +41,23 @@ class Contributions:
 
 
 def live_on(
-    picture: Picture, time: int, support: Support, config: CentreConfig, journal: Journal
-) -> tuple[Picture, NDArray[np.bool_]]:
-    """One step of every life, told to the journal: the picture, and which of its tracks (G,) end now."""
+    picture: Picture, time: int, support: Support, config: CentreConfig, journal: Journal,
+    held: Callable[[NDArray[np.uint64]], NDArray[np.bool_]] | None = None,
+) -> tuple[Picture, NDArray[np.bool_], NDArray[np.bool_]]:  # fmt: skip
+    """One step of every life, told to the journal: the picture, which of its tracks (G,) leave it now, and which of
+    those are suspended; held: which of the tracks of these ids, that end by silence alone, are."""
     before = picture.status
     picture, ended = advance(picture, time, support, config)
-    for track in picture.id[ended].tolist():
+    waits = np.zeros(len(ended), dtype=np.bool_)
+    if held is not None and ended.any():
+        silent = np.flatnonzero(ended & (before != messages.TENTATIVE) & ~support.dropped)
+        silent = silent[picture.existence[silent] >= config.min_existence]
+        waits[silent] = held(picture.id[silent])
+    for track in picture.id[ended & ~waits].tolist():
         journal.end(track, "lost", None)
     for status, decision in ((messages.CONFIRMED, messages.CONFIRMED_NOW), (messages.COASTING, messages.COASTING_NOW)):
         journal.tracks(decision, picture.id[(picture.status == status) & (before != status) & ~ended])
-    return picture, ended
+    return picture, ended, waits
 
 
 def picture_message(

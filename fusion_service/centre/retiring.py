@@ -16,10 +16,11 @@ __all__ = ["leave_out", "retire"]
 NOTHING: Ints = np.zeros(0, dtype=np.intp)
 
 
-def retire(source: Source, said: SourceConfig, time: int, room: int, config: CentreConfig) -> Tracks:
+def retire(source: Source, said: SourceConfig, time: int, room: int, config: CentreConfig, awake: int = -1) -> Tracks:
     """The tracks of `source` that are not stale at `time`, ns, which is its table from now on. Of the others at most
-    `room` are remembered."""
+    `room` are remembered. awake: since when silence counts, ns."""
     table, age = source.tracks, time - source.tracks.time
+    age = np.minimum(age, time - awake) if 0 <= awake <= time else age
     limit = silence(table.interval, said, config)
     source.why = "" if source.why == notes.waiting() else source.why
     late = age > limit
@@ -28,7 +29,7 @@ def retire(source: Source, said: SourceConfig, time: int, room: int, config: Cen
         source.tracks = table.take(~late)
     oldest = time - round(config.remember * 1e9)
     if retired or len(source.remembered.id):
-        gone = Remembered(table.id[late], table.time[late], table.interval[late])
+        gone = Remembered(table.id[late], table.time[late], table.interval[late], table.link[late])
         source.remembered = remember(source.remembered, gone, source.tracks.id, oldest, room)
     new = marked(late) if retired and source.arrived else NOTHING
     if len(new):

@@ -161,7 +161,7 @@ class Source:
 
     def _known(self, tracks: Tracks) -> Remembered:
         """The intervals of `tracks` and of what is remembered, sorted by id."""
-        there = Remembered(tracks.id, tracks.time, tracks.interval)
+        there = Remembered(tracks.id, tracks.time, tracks.interval, tracks.link)
         if not len(self.remembered.id):
             return there
         both = Remembered(*(np.concatenate(pair) for pair in zip(there, self.remembered, strict=True)))

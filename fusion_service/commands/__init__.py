@@ -25,6 +25,7 @@ from fusion_service.commands import (
     rules,
     run,
     status,
+    verify,
 )
 
 __all__ = ["COMMANDS"]
@@ -46,6 +47,7 @@ COMMANDS: dict[str, ModuleType] = {
         evaluate,
         explain,
         export,
+        verify,
         repair,
     )
 }

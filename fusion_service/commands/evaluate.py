@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fusion_service.commands.sealed import add_authority
 from fusion_service.process import argument, positive
 from fusion_service.progress import Progress
 
@@ -45,10 +46,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--centre", metavar="NAME", action="append", help="only this centre; may be repeated")
     parser.add_argument("--json", metavar="FILE", help="write every number here")
     parser.add_argument("--html", metavar="FILE", help="write a page for people here")
+    add_authority(parser)
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Score the recordings. Raises `ReviewError`, OSError."""
+    from fusion_service.commands.sealed import find, say
     from fusion_service.errors import ReviewError, Stopped
     from fusion_service.review.evaluation.results import results, text
     from fusion_service.review.evaluation.truth import read_truth
@@ -62,11 +65,14 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
 
         need_matplotlib()
     done: list[Assessment] = []
+    seals = []
     try:
         truths = read_truth(Path(args.truth)) if args.truth else []
         for path in map(Path, args.recordings):
             cutoff = args.cutoff or (done[0].c if done else None)
-            done.append(_assess(path, truths, cutoff, args, stop))
+            scored = _assess(path, truths, cutoff, args, stop)
+            seals.append(find(str(path), args.ca, stop))
+            done.append(scored)
     except Stopped:
         print(f"stopped: {len(done)} of {len(args.recordings)} recordings are scored")
     if not done:
@@ -78,8 +84,13 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
         )
     print(text(done))
+    for recording, seal in zip(args.recordings, seals, strict=False):
+        say(recording, seal)
     if args.json:
-        Path(args.json).write_text(json.dumps(results(done), allow_nan=False) + "\n", encoding="utf-8")
+        scores = results(done)
+        for told, seal in zip(scores["recordings"], seals, strict=False):
+            told["seal"] = seal.as_json()
+        Path(args.json).write_text(json.dumps(scores, allow_nan=False) + "\n", encoding="utf-8")
         print(f"scores: {args.json}")
     if args.html:
         from fusion_service.review.evaluation.report import report

@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import threading
 
+from fusion_service.commands.sealed import add_authority
+
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "Where a global track came from, what each source brought, and what became of it."
@@ -32,10 +34,12 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", metavar="FILE", help="write a recording of this track alone, with its local tracks and truth"
     )
+    add_authority(parser)
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Tell what became of a track, or list them. Raises `UsageError`, `ReviewError`."""
+    from fusion_service.commands.sealed import tell
     from fusion_service.errors import Stopped, UsageError
     from fusion_service.review.explain import explanation, listing, read_mission, write_view
     from fusion_service.review.outputs import check_recording
@@ -45,6 +49,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     if args.out is not None:
         check_recording(args.out, args.recording)
     try:
+        tell(args.recording, args.ca, stop)
         mission = read_mission(args.recording, track=args.track, at=args.at, centre=args.centre, stop=stop)
     except Stopped as stopped:
         print(stopped)

@@ -6,6 +6,8 @@ import argparse
 import threading
 from pathlib import Path
 
+from fusion_service.commands.sealed import add_authority
+
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "Tracks of a recording as a table, CSV or Parquet."
@@ -23,12 +25,15 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, metavar="FILE", help="new file, .csv or .parquet")
     parser.add_argument("--what", default="global", metavar="WHAT", help="global (default), truth, or a source's name")
     parser.add_argument("--centre", metavar="NAME", help="whose global tracks (default: the first centre's)")
+    add_authority(parser)
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Write the table. Raises `ReviewError`, FileExistsError, OSError."""
+    from fusion_service.commands.sealed import tell
     from fusion_service.review.export import export
 
+    tell(args.recording, args.ca, stop)
     done = export(Path(args.recording), Path(args.out), args.what, args.centre, stop.is_set)
     print(f"{args.out}: {done.rows} rows, {done.times} times" + (", stopped early" if stop.is_set() else ""))
     for reason, count in sorted(done.left_out.items()):

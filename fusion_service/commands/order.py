@@ -21,8 +21,8 @@ EXAMPLE = """fusion-service order list
   fusion-service order withdraw 4
   fusion-service order handover                               the one that stands by goes on, for an upgrade"""
 HANDOVER = "handover"
-ANSWER = 5.0
-"""Seconds that a centre has for its answer, and the hub to be there."""
+ANSWER = 10.0
+"""Seconds that a centre has for its answer, which comes when a step has obeyed, and the hub to be there."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -102,7 +102,9 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     elif args.what == HANDOVER:
         raise OrderError(f"no handover: {answer['outcome']}")
     elif answer["done"]:
-        print(f"order {answer['number']}: {answer['outcome']}")
+        more = ", when a step is made: none is at the moment" if answer.get("pending") else ""
+        more += "" if answer.get("kept", True) else " (not on disk: the service keeps no state, or cannot write it)"
+        print(f"order {answer['number']}: {answer['outcome']}{more}")
     else:
         raise OrderError(f"order {answer['number']} is refused: {answer['outcome']}")
 
@@ -156,6 +158,12 @@ def _missing(request: dict[str, Any]) -> str:
     return " and ".join(options[name] for name in needed if name not in request)
 
 
+def _giver(one: dict[str, Any]) -> str:
+    from fusion_service.order import giver_of
+
+    return giver_of(one["who"], one.get("proven", False)) if one.get("who") else ""
+
+
 def _table(orders: list[dict[str, Any]]) -> str:
     """The standing orders, one a line."""
     from datetime import UTC, datetime
@@ -171,6 +179,6 @@ def _table(orders: list[dict[str, Any]]) -> str:
             if "until" in one
             else ""
         )
-        said = [", ".join(part for part in about if part), until, one.get("who", ""), one.get("why", "")]
+        said = [", ".join(part for part in about if part), until, _giver(one), one.get("why", "")]
         lines.append(f"{one['number']:>4}  {one['what']:<11}" + "  ".join(part for part in said if part))
     return "\n".join(lines) or "no order stands"

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import threading
 from contextlib import ExitStack
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.commands.arguments import duration, port, size
 from fusion_service.process import argument
 
+if TYPE_CHECKING:
+    from fusion_service.bus.security import Security
+    from fusion_service.recording.signing import Signer
+
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
+
+log = logging.getLogger(__name__)
 
 HELP = "Record everything on the bus."
 EXAMPLE = """fusion-service record --out mission.rrd
   fusion-service record --out mission/ --rotate-every 1h --keep-for 7d     parts 0001.rrd, 0002.rrd, ...
+  fusion-service record --out mission.rrd --sign rec.key                   signed: `verify` and others check it
   fusion-service record --live       look on with: rerun --connect rerun+http://127.0.0.1:9876/proxy
   fusion-service record --live-web   look on in a browser"""
 
@@ -35,7 +44,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help=f"hub to join (default {DEFAULT_ENDPOINT})",
     )
-    parser.add_argument("--security", metavar="FILE", help="the recorder's certificate (see `fusion-service keys`)")
+    parser.add_argument(
+        "--security",
+        metavar="FILE",
+        help="the recorder's certificate, which signs the recording too (see `fusion-service keys`)",
+    )
     parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
     parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
     parser.add_argument(
@@ -44,6 +57,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         default=1.0,
         metavar="TIME",
         help="what a kill may cost at most (default 1s)",
+    )
+    parser.add_argument(
+        "--sign", metavar="KEY", help="sign the recording by this private key, PEM, without a certificate"
     )
     parser.add_argument("--no-draw", action="store_true", help="record the messages alone, without the picture")
     weeks = parser.add_argument_group("for weeks", "any of these makes the recording a folder of parts")
@@ -79,6 +95,21 @@ def _address(text: str) -> tuple[str, int]:
     return address(text)
 
 
+def _signer(key: str | None, security: Security | None) -> Signer | None:
+    """By a key alone, or by the recorder's certificate; where that cannot sign, a recording without a signature is
+    better than none."""
+    from fusion_service.errors import UsageError
+    from fusion_service.recording.signing import load_signer
+
+    if key is not None:
+        return load_signer(Path(key))
+    try:
+        return load_signer(security.key, security.certificate) if security else None
+    except (ImportError, UsageError) as error:
+        log.warning("the recording is not signed: %s", error)
+        return None
+
+
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Record until `stop` is set. Raises `UsageError`, `SecurityError`, `BusError`, `ReviewError`,
     ImportError, OSError."""
@@ -103,6 +134,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     if (args.live or args.live_web) and args.no_draw:
         raise UsageError("--live shows what is drawn: leave out --no-draw")
     security = maybe_security(args.security)
+    signer = _signer(args.sign, security)
     with ExitStack() as stack:
         live = None
         if args.live or args.live_web:
@@ -118,6 +150,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             cutoff=args.cutoff,
             draw=not args.no_draw,
             rotation=rotation,
+            signer=signer,
             live=live,
             interval=args.flush,
         )

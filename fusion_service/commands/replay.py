@@ -7,6 +7,8 @@ import json
 import threading
 from pathlib import Path
 
+from fusion_service.commands.sealed import add_authority
+
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "Fuse a recorded mission again: as it was, or under other rules and settings, side by side."
@@ -46,10 +48,12 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--no-drawing", action="store_true", help="write the messages alone (faster): nothing to look at"
     )
     parser.add_argument("--json", metavar="FILE", help="write what came of it here")
+    add_authority(parser)
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Fuse it again. Raises `UsageError`, `ConfigError`, `ReviewError`: of --verify too, where the tracks differ."""
+    from fusion_service.commands.sealed import tell
     from fusion_service.compiled import is_kept, use
     from fusion_service.errors import ReviewError, UsageError
     from fusion_service.review.outputs import check_page, check_recording
@@ -61,6 +65,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         check_page(args.json, args.recording, *filter(None, [args.config]))
     if args.out is not None:
         check_recording(args.out, args.recording)
+    tell(args.recording, args.ca, stop)
     if is_kept():  # the same bits, sooner
         use("auto")
     replay = run_replay(

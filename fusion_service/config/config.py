@@ -49,6 +49,8 @@ __all__ = [
     "CentreConfig",
     "ConfigError",
     "DaemonConfig",
+    "FlowConfig",
+    "LimitsConfig",
     "ServiceConfig",
     "SourceConfig",
     "config_hash",
@@ -56,17 +58,19 @@ __all__ = [
 
 
 LATER = (
-    *("trigger", "arrival_spacing", "revise", "weights", "compiled"),
-    *("track_components", "message_components", "component_pairs", "forget"),
+    *("trigger", "arrival_spacing", "revise", "weights", "compiled", "clock_votes"),
+    *("track_components", "message_components", "component_pairs", "forget", "suspend"),
 )
 """Settings that came after hashes were recorded; their defaults are what there was before, or `BEFORE` says."""
 BEFORE: dict[str, Any] = {
     "revise": 0.0,
     "weights": "best",
+    "clock_votes": "all",
     "track_components": 2**16,
     "message_components": 2**24,
     "component_pairs": 2**62,
     "forget": 0.0,
+    "suspend": False,
 }
 """What stands where recorded settings do not say them."""
 
@@ -141,6 +145,12 @@ class CentreConfig:
     frame: Frame | None = _setting(None, read_frame, "frame of the picture; left out: what sources agree on")
     frame_wait: float = _setting(5.0, DURATION, "seconds after which the most supported frame is taken")
     clock: str = _setting("wall", choice("wall", "message"), "step by wall clock, or by the messages' own time")
+    clock_votes: str = _setting(
+        "auto",
+        choice("auto", "configured", "all"),
+        "whose messages move the clock of the messages: sources with a table here, or all; auto: those with a table, "
+        "where there are any and no certificates",
+    )
     trigger: str = _setting(
         "period", choice("period", "arrival"), "step every period, or as soon as a scan is in, at the scan's time"
     )
@@ -225,7 +235,14 @@ class CentreConfig:
     forget: float = _setting(
         300.0, DURATION, "seconds after which a source that is gone and silent is forgotten; 0: none is, nor rests"
     )
-    remember: float = _setting(600.0, DURATION, "seconds for which a stale track's id and interval are remembered")
+    remember: float = _setting(
+        600.0,
+        DURATION,
+        "seconds for which a stale track's id, link and interval, and a suspended track, are remembered",
+    )
+    suspend: bool = _setting(
+        True, flag, "tracks that only sources silent as a whole could see are suspended, and do not end, after coast"
+    )
     intensity_rule: str = _setting(
         "hybrid",
         choice("aa", "ga", "hybrid"),
@@ -316,12 +333,32 @@ class DaemonConfig:
 
 
 @dataclass(frozen=True)
+class FlowConfig:
+    """How much is taken of one source; 0: any."""
+
+    messages: float = _setting(
+        5e3, number(0, 1e9), "messages a second from one source; what is beyond any limit is dropped (flow); 0: none is"
+    )
+    bytes: float = _setting(1e8, number(0, 1e12), "bytes a second")
+    tracks: float = _setting(1e6, number(0, 1e12), "tracks a second, or components of intensities")
+    burst: float = _setting(2.0, number(0.01, 3600), "seconds of all this that may come at once")
+
+
+@dataclass(frozen=True)
+class LimitsConfig(FlowConfig):
+    """The same for each source, but for those named."""
+
+    sources: dict[str, FlowConfig] = _setting({}, table, "by name, over the others")
+
+
+@dataclass(frozen=True)
 class ServiceConfig:
     """The whole file."""
 
     centre: CentreConfig = CentreConfig()
     bus: BusConfig = BusConfig()
     service: DaemonConfig = DaemonConfig()
+    limits: LimitsConfig = LimitsConfig()
 
 
 def config_hash(config: CentreConfig) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from fusion_service.config.config import BusConfig, CentreConfig, DaemonConfig, SourceConfig
+from fusion_service.config.config import BusConfig, CentreConfig, DaemonConfig, LimitsConfig, SourceConfig
 from fusion_service.config.toml_text import toml_value
 
 __all__ = ["example_toml"]
@@ -18,6 +18,7 @@ def example_toml() -> str:
         ("centre.source_defaults", SourceConfig()),
         ("bus", BusConfig()),
         ("service", DaemonConfig()),
+        ("limits", LimitsConfig()),
     ]
     lines: list[str] = []
     for name, table in tables:
@@ -33,5 +34,6 @@ def example_toml() -> str:
     lines += [
         "# [centre.sources.radar1]                  # any key of source_defaults for one source",
         "# override = true",
+        "# [limits.sources.radar1]                  # any key of limits for one source",
     ]
     return "\n".join(lines) + "\n"

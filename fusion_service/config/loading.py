@@ -17,6 +17,8 @@ from fusion_service.config.config import (
     CentreConfig,
     ConfigError,
     DaemonConfig,
+    FlowConfig,
+    LimitsConfig,
     ServiceConfig,
     SourceConfig,
 )
@@ -55,6 +57,7 @@ def load_config(path: str | Path) -> ServiceConfig:
         centre=_read_centre(raw.get("centre", {}), ("centre",), problems),
         bus=_read(BusConfig, raw.get("bus", {}), ("bus",), problems, here),
         service=_read(DaemonConfig, raw.get("service", {}), ("service",), problems),
+        limits=_read_limits(raw.get("limits", {}), ("limits",), problems),
     )
     if problems:
         lines = key_lines(text)
@@ -113,6 +116,20 @@ def _read_centre(raw: Any, where: tuple[str, ...], problems: Problems) -> Centre
         place = "rule_options" if config.rule_options else "rule"
         problems.extend(((*where, place), what) for what in _rule_problems(config))
     return dataclasses.replace(config, source_defaults=defaults, sources=sources)
+
+
+def _read_limits(raw: Any, where: tuple[str, ...], problems: Problems) -> LimitsConfig:
+    given = raw.get("sources", {}) if isinstance(raw, Mapping) else {}
+    rest = {name: value for name, value in raw.items() if name != "sources"} if isinstance(raw, Mapping) else raw
+    limits = _read(LimitsConfig, rest, where, problems)
+    if not isinstance(given, Mapping):
+        problems.append(((*where, "sources"), f"is {given!r}, must be a table of tables"))
+        return limits
+    sources = {
+        str(name): _read(FlowConfig, value, (*where, "sources", str(name)), problems, limits)
+        for name, value in given.items()
+    }
+    return dataclasses.replace(limits, sources=sources)
 
 
 def _read_sources(

@@ -29,6 +29,9 @@ SAID = {
     "too-many-sources": ("source", "the centre has no room for another source: end those that are not needed"),
     "pending": ("", "it sends more between two steps than max_pending: send less often, or raise max_pending"),
     "queue": ("", "more came than the queue holds: send less often, or raise queue under [bus]"),
+    "flow": ("", "it sends more than the limits of the service let in: send less, or raise them under [limits]"),
+    "fusion": ("covs", "a fusion with it was numerically impossible, and bounded instead: are its covariances sound?"),
+    "ill-conditioned": ("covs", "its density is not sound when predicted to the step: is its covariance extreme?"),
     "overtaken": ("", "the service is behind, and newer scans of it were taken instead"),
     "failed": ("", "a step failed for this message, which is a fault of the service: report it with the recording"),
 }

@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from fusion_service.bus.inbox import Inbox
 from fusion_service.recording.parts import Rotation
@@ -19,6 +19,7 @@ from schemas import REALM, Frame
 if TYPE_CHECKING:
     from fusion_service.bus import Bus
     from fusion_service.recording.live import Live
+    from fusion_service.recording.signing import Signer
 
 __all__ = ["default_path", "run_recorder"]
 
@@ -57,6 +58,7 @@ def run_recorder(
     draw: bool = True,
     rotation: Rotation | None = None,
     live: Live | None = None,
+    signer: Signer | None = None,
     interval: float = 1.0,
     on_tick: Callable[[Recorder], None] | None = None,
 ) -> Recorder:
@@ -78,9 +80,8 @@ def run_recorder(
     ]
     try:
         path = path or default_path(suffix=".rrd" if rotation is None else "")
-        with Recorder(
-            path, realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw, rotation=rotation, live=live
-        ) as recorder:
+        how: dict[str, Any] = {"rotation": rotation, "live": live, "signer": signer}
+        with Recorder(path, realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw, **how) as recorder:
             log.info("recording %s/v1/** into %s", realm, path)
             dropped = _loop(inbox, recorder, stop, interval, on_tick or (lambda recorder: None))
             for declaration in declared:

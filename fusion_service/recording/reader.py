@@ -23,7 +23,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -33,7 +33,7 @@ from fusion_service.recording.parts import number_of, parts
 from fusion_service.recording.salvage import HEADER, salvage, whole_part
 from schemas import Message, MessageError, decode
 
-__all__ = ["RawMessage", "has_index", "messages", "read", "recording_id", "repair"]
+__all__ = ["RawMessage", "Watch", "has_index", "messages", "read", "read_file", "recording_id", "repair", "stored"]
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +48,16 @@ class RawMessage(NamedTuple):
     data: bytes
 
 
+class Watch(Protocol):
+    """Who is shown what else there is in a file."""
+
+    def seals(self, chunk: Any) -> None:
+        """A chunk of what is below /seal."""
+
+    def double(self, message: RawMessage) -> None:
+        """A message that is left out, for one with its number was read before."""
+
+
 def read(path: str | Path) -> Iterator[RawMessage]:
     """Every recorded message of a file, or of a folder of parts, in the order of arrival, decodable or not.
 
@@ -60,7 +70,7 @@ def read(path: str | Path) -> Iterator[RawMessage]:
         return
     if not path.is_file():
         raise FileNotFoundError(f"no recording at {path}")
-    for message, _ in _read_file(path):
+    for message, _ in read_file(path):
         yield message
 
 
@@ -79,7 +89,7 @@ def _read_parts(folder: Path) -> Iterator[RawMessage]:
         before, ended, begun = number, last, 0
         begins: list[str] = []
         try:
-            for message, standing in _read_file(path, begins):
+            for message, standing in read_file(path, begins):
                 if standing and infos.get(message.key) == message.data:
                     continue
                 if message.key.endswith("/info"):
@@ -94,14 +104,19 @@ def _read_parts(folder: Path) -> Iterator[RawMessage]:
             log.warning("%s: %.1f s without a recorder before part %d", folder, (begun - ended) / 1e9, number)
 
 
-def _read_file(path: Path, begins: list[str] | None = None) -> Iterator[tuple[RawMessage, bool]]:
-    """Each message, and whether it is repeated from an earlier part. `begins` is told how the part began, as `Recorder`
-    wrote it."""
-    content = ["/raw/**"] if begins is None else ["/raw/**", "/__properties/part"]
+def read_file(
+    path: Path, begins: list[str] | None = None, watch: Watch | None = None
+) -> Iterator[tuple[RawMessage, bool]]:
+    """Each message of one file, with its arrival number there, and whether it is repeated from an earlier part.
+    `begins` is told how the part began, as `Recorder` wrote it; `watch` of seals. Raises as `read`."""
+    content = ["/raw/**", *["/__properties/part"] * (begins is not None), *["/seal/**"] * (watch is not None)]
     with tempfile.TemporaryDirectory(prefix="rrd-") as folder:
         waiting: list[tuple[RawMessage, bool]] = []
         following = 0
-        for chunk in _chunks(path, Path(folder), content):
+        for chunk, again in _chunks(path, Path(folder), content):
+            if watch is not None and chunk.entity_path.startswith("/seal/"):
+                watch.seals(chunk)
+                continue
             if begins is not None and not chunk.entity_path.startswith("/raw/"):
                 batch = chunk.to_record_batch()
                 if "begins" in batch.schema.names:
@@ -109,8 +124,10 @@ def _read_file(path: Path, begins: list[str] | None = None) -> Iterator[tuple[Ra
                 continue
             standing = chunk.entity_path.startswith("/raw/standing/")
             for message in _rows(chunk):
-                if message.arrival >= following:  # else it was read before a damage was met
+                if message.arrival >= following:
                     heapq.heappush(waiting, (message, standing))
+                elif watch is not None and not again:
+                    watch.double(message)
             while waiting and waiting[0][0].arrival == following:
                 yield heapq.heappop(waiting)
                 following += 1
@@ -122,19 +139,22 @@ def _read_file(path: Path, begins: list[str] | None = None) -> Iterator[tuple[Ra
             last = one[0].arrival
 
 
-def _chunks(path: Path, folder: Path, content: list[str]) -> Iterator[Any]:
-    """The chunks of a file. Of a torn one, those of its whole part; where it is damaged, those of what decodes."""
+def _chunks(path: Path, folder: Path, content: list[str]) -> Iterator[tuple[Any, bool]]:
+    """The chunks of a file. Of a torn one, those of its whole part; where it is damaged, those of what decodes, with
+    those that may have been read already before the damage was met."""
     whole, damaged = whole_part(path)
     copy = folder / path.name
     try:
         if not damaged:
-            yield from _open(_torn(path, copy, whole), path).stream().filter(content=content)
+            for chunk in _open(_torn(path, copy, whole), path).stream().filter(content=content):
+                yield chunk, False
     except RuntimeError:
         damaged = True
     if damaged:
         lost = salvage(path, copy)
         log.warning("%s is damaged: %s", path, lost)
-        yield from _open(copy, path).stream().filter(content=content)
+        for chunk in _open(copy, path).stream().filter(content=content):
+            yield chunk, True
 
 
 def _torn(path: Path, copy: Path, whole: int) -> Path:
@@ -145,6 +165,11 @@ def _torn(path: Path, copy: Path, whole: int) -> Path:
     shutil.copyfile(path, copy)
     os.truncate(copy, whole)
     return copy
+
+
+def stored(path: Path, content: list[str]) -> Iterator[Any]:
+    """The chunks of some entities of a file that opens."""
+    yield from _open(path).stream().filter(content=content)
 
 
 def recording_id(path: Path) -> str:

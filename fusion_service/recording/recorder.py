@@ -3,6 +3,7 @@
     /raw/{local|global|truth}/...     each message: its key and its bytes, on `arrival`, `received` and,
                                       where it has one, `time`
     /raw/standing/...                 in a part that goes on from another: the newest info of every source again
+    /seal/...                         a chain of hashes over all these, signed where there is a key (`chain`)
 
 and the entities of `drawing`, `charts` and `event_log`. What came is queued by `handle` and written by `tick`,
 the raw bytes first; after `tick` has returned it is in the hands of the operating system, and a recorder that
@@ -33,10 +34,12 @@ from fusion_service.recording.drawing.scene import MAX_SOURCES, PATIENCE, Scene
 from fusion_service.recording.parts import Folder, Rotation, begin, is_folder, number_of, parts
 from fusion_service.recording.reader import recording_id
 from fusion_service.recording.repair import mend
+from fusion_service.recording.sealing import Sealer, last_link
 from schemas import REALM, Frame, Message, MessageError, SensorInfo, check_realm, decode, parse_key
 
 if TYPE_CHECKING:
     from fusion_service.recording.live import Live
+    from fusion_service.recording.signing import Signer
 
 __all__ = ["Recorder"]
 
@@ -68,7 +71,7 @@ class Recorder:
     come in the first seconds. cutoff: of the assignment of tracks to true objects, m; None chooses one for each step.
     trail: seconds of each trail that are seen at first. draw: False records the messages alone. focus: the id of a
     global track; the recording opens on this one alone, with its series. live: shown the same picture; closed with
-    the recorder.
+    the recorder. signer: signs the chain of hashes.
     """
 
     def __init__(
@@ -83,6 +86,7 @@ class Recorder:
         rotation: Rotation | None = None,
         focus: int | None = None,
         live: Live | None = None,
+        signer: Signer | None = None,
     ) -> None:
         import_rerun()
         self.path = Path(path)
@@ -105,6 +109,7 @@ class Recorder:
         self._broken = False
         self._stream: Any = None
         self._writing: BinaryIO | None = None
+        self._sealer = Sealer(signer, keeps=rotation is not None and rotation.keeps)
 
         self._folder: Folder | None = None
         begins = "start"
@@ -162,6 +167,7 @@ class Recorder:
         at = self._scene.mission_time(message)
         path = entity("raw", *key.removeprefix(self._prefix).split("/"))
         self._raw.add(path, raw, Stamp(received, at, self._arrival), (key, data))
+        self._sealer.add(key, data, received)
         self._arrival += 1
         self.messages += 1
         self.bytes += len(data)
@@ -212,6 +218,7 @@ class Recorder:
                     self._say(f"{count} tracks or messages were not drawn: {reason}", time.time_ns())
                 self._scene.event_log.release(self._scene.now)
                 self._columns.send()
+                self._sealer.seal("recording")
                 if self._live is not None:
                     self._live.push()
         finally:
@@ -234,6 +241,7 @@ class Recorder:
             try:
                 done = mend(path, index=False)
                 self._id = recording_id(path)
+                self._sealer.follow(last_link(there))
             except (ReviewError, OSError) as error:
                 log.warning("%s is left as it is: %s", path, error)
                 continue
@@ -249,13 +257,16 @@ class Recorder:
         stream = rr.RecordingStream(APPLICATION, recording_id=self._id, send_properties=True)
         stream.set_sinks(rr.FileSink(str(self.path)))
         stream.send_recording_name(self.path.stem if self._folder is None else self.path.parent.name)
+        part = (number_of(self.path) or 0) if self._folder is not None else 0
         stream.send_property("part", rr.AnyValues(number=number_of(self.path) or 0, begins=begins))
         self._stream = stream
+        self._sealer.begin(stream, self._id, part)
 
     def _rotate(self, folder: Folder) -> None:
         """End the part and begin the next. What comes meanwhile waits before `handle`."""
         began = time.monotonic()
         self._write(0.0)
+        self._sealer.seal("part")
         self._flush()
         self._disconnect()
         self._stream, before = None, self.path
@@ -268,6 +279,7 @@ class Recorder:
         for _, _, key, data, received in self._infos.values():
             path = entity("raw", "standing", *key.removeprefix(self._prefix).split("/"))
             self._raw.add(path, raw, Stamp(received, None, self._arrival), (key, data))
+            self._sealer.add(key, data, received, standing=True)
             self._arrival += 1
         self._repeated = self._arrival
         self._scene.restart()
@@ -310,6 +322,7 @@ class Recorder:
 
     def _write(self, interval: float, patience: float = PATIENCE) -> None:
         self._raw.send()
+        self._sealer.seal()
         for (key, reason), count in self._bad.most_common(LINES):
             self._say(f"{count} messages on {key} do not decode: {reason}", time.time_ns())
         self._bad.clear()

@@ -10,12 +10,13 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from fusion_service.config import CentreConfig
 from fusion_service.hints import Finding, Listened, read_finding, refusal_finding
 from fusion_service.service.bounded import BoundedLog
-from schemas import Frame, Message, StepLog
+from schemas import Frame, Message, Status, StepLog
 
 __all__ = ["Complaints"]
 
@@ -107,7 +108,7 @@ class Complaints:
         for entry in (*journal.refused, *journal.dropped):
             if entry.reason == "overtaken":  # the service is behind, which it says itself
                 continue
-            if not entry.hash and entry.reason not in ("queue", "failed", "too-many-sources"):
+            if not entry.hash and entry.reason not in ("queue", "flow", "failed", "too-many-sources"):
                 continue
             one = next(
                 (
@@ -151,9 +152,9 @@ class Complaints:
             if time.perf_counter() - begin > THINKING:
                 break
 
-    def told(self, sources: Mapping[str, dict[str, Any]]) -> dict[str, dict[str, Any]]:
-        """What is said of sources in a status, with their last refusals and what is doubtful. On any thread."""
-        out = dict(sources)
+    def told_in(self, status: Status) -> Status:
+        """A status with the last refusal of each source, its figures, and what is doubtful. On any thread."""
+        out = dict(status.sources)
         for name, last in list(self._last.items()):
             if name in out or len(out) < MOST_NAMED:
                 out[name] = {**out.get(name, {}), "last_refusal": dict(last)}
@@ -163,7 +164,7 @@ class Complaints:
         for name, doubts in list(self._doubts.items()):
             if doubts and (name in out or len(out) < MOST_NAMED):
                 out[name] = {**out.get(name, {}), "doubts": list(doubts)}
-        return out
+        return replace(status, sources=out)
 
     def _found(self, reason: str, find: Callable[[], Finding]) -> Finding:
         """What is found, or the reason alone should that fail."""

@@ -17,7 +17,6 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
-from fusion_service import __version__
 from fusion_service.bus import Bus, Inbox, open_bus
 from fusion_service.bus.security import check_party, maybe_security
 from fusion_service.centre import (
@@ -35,12 +34,14 @@ from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.complaints import Complaints
+from fusion_service.service.flow import Flow
 from fusion_service.service.heartbeat import Heartbeat
 from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.overload import Overload, overtaken
+from fusion_service.service.promises import Reply
 from fusion_service.service.state import State, open_state
-from fusion_service.service.status import StatusMaker, status_line
+from fusion_service.service.status import StatusMaker, start_line, status_line
 from fusion_service.service.stepping import LastingCentre
 from fusion_service.service.succession import succeed
 from fusion_service.service.tenure import Tenure
@@ -92,9 +93,7 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
     security = maybe_security(config.bus.security)
     if security is not None:
         check_party(security, ("centre",), config.centre.name)
-    hub, folder = ", ".join(config.bus.connect), config.service.state or "nowhere"
-    words = "fusion-service %s: centre %s of realm %s, at the hub %s, state kept in %s"
-    log.info(words, __version__, config.centre.name, config.bus.realm, hub, folder)
+    log.info("%s", start_line(config))
     with open_state(config.service.state) as state:
         join = partial(open_bus, config.bus.connect, stop=stop, security=security)
         succeed(config, state, stop, join, Service, standby)
@@ -115,9 +114,11 @@ class Service:
         self._told = BoundedLog(config.service.log_refusals)
         self._complaints = Complaints(config.centre, self._told)
         self._tokens = Tokens(self._inbox.wake)
-        self._desk = OrderDesk(lambda order: self._inbox.put("", order))
+        self._desk = OrderDesk(lambda order: self._inbox.put("", order), secured=config.bus.security is not None)
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
-        self._times = StepTimes(config.centre)
+        self._desk.promises.may = self._tenure.may_publish
+        self._times = StepTimes(config.centre, authenticated=config.bus.security is not None)
+        self._flow = Flow(config.limits)
         self._overload = Overload(self._times.patience)
         self._dropped: Counter[str] = Counter()
         self._result: StepResult | None = None
@@ -156,6 +157,7 @@ class Service:
                     self._told.error("the loop failed %d times", self._counts["failed_turns"])
                     stop.wait(0.1)
         self._lasting.save(at_once=True)
+        self._desk.promises.close()
         if not stop.is_set():
             log.warning("stands down: %s", self._tenure.farewell)
             return
@@ -197,8 +199,10 @@ class Service:
             bus.watch(global_key(centre, "alive", realm), self._tokens.note)
             bus.subscribe(global_key(centre, "tracks", realm), self._on_sample, on_miss=self._on_miss)
         bus.answer(global_key(name, "picture", realm), self._on_picture)
-        bus.answer(global_key(name, "orders", realm), self._on_order)
-        bus.answer_each(order_key(name, "*", realm), lambda key, asked: self._on_order(asked, key.rsplit("/", 1)[1]))
+        bus.answer_later(global_key(name, "orders", realm), lambda _, asked, reply: self._on_order(asked, reply))
+        bus.answer_later(
+            order_key(name, "*", realm), lambda key, asked, reply: self._on_order(asked, reply, key.rsplit("/", 1)[1])
+        )
         bus.announce(global_key(name, "alive", realm))
 
     def _wake_at(self, stop: threading.Event) -> None:
@@ -209,15 +213,19 @@ class Service:
 
     def _on_sample(self, key: str, data: bytes) -> None:
         scope, name, _ = key.rsplit("/", 3)[-3:]
-        self._inbox.put(
-            centre_source(name) if scope == "global" else name, Arrival(key, data, time.time_ns()), len(data)
-        )
+        source = centre_source(name) if scope == "global" else name
+        if self._flow.takes(source, len(data)):
+            self._inbox.put(source, Arrival(key, data, time.time_ns()), len(data))
 
     def _on_miss(self, key: str, count: int) -> None:
         self._counts["missed"] += count
 
-    def _on_order(self, payload: bytes | None, operator: str = "") -> bytes:
-        return self._tenure.ordered(payload, operator) or self._desk.answer(payload, operator)
+    def _on_order(self, payload: bytes | None, reply: Reply, operator: str = "") -> None:
+        may = bool(operator) or self._config.bus.security is None
+        if may and (answer := self._tenure.ordered(payload, operator)) is not None:
+            reply(answer)
+        else:
+            self._desk.answer(payload, reply, operator)
 
     def _on_picture(self, payload: bytes | None) -> bytes:
         if self._result is None:
@@ -228,7 +236,7 @@ class Service:
 
     def _take(self, timeout: float) -> list[Arrival | Order]:
         """What has come; where the service is behind, of each source the newest complete scan only."""
-        items = self._inbox.take(timeout)
+        items = self._inbox.take(min(timeout, self._desk.promises.wait()))
         self._taken = time.time_ns()
         oldest = next((item.received for _, item in items if isinstance(item, Arrival)), self._taken)
         if self._overload.look(time.monotonic(), (self._taken - oldest) / 1e9, self._times.skipped):
@@ -242,7 +250,7 @@ class Service:
         if isinstance(item, Order):
             fault = f": {item.refused}" * bool(item.refused)
             if self._told.allows(f"orders {item.number % 20}", 1.0):  # twenty lines a second: the step log has them all
-                log.info("order %d of %s: %s%s", item.number, item.who or "?", item.what, fault)
+                log.info("order %d of %s: %s%s", item.number, item.giver, item.what, fault)
             self._lasting.handle(item, time.time_ns())
             return
         self._counts["messages"] += 1
@@ -261,6 +269,7 @@ class Service:
             self._complaints.misnamed(name, source_of(message), item.received)
             return
         self._complaints.heard(name, message, len(item.data), item.received)
+        self._flow.read(name, message)
         fault = ""
         if isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)):
             fault = self._times.fault(message, item.received)
@@ -287,6 +296,11 @@ class Service:
             if new := total - self._dropped[name]:
                 self._dropped[name] = total
                 self._lasting.handle(Refused(name, "queue", new, dropped=True), time.time_ns())
+        beyond = self._flow.news()
+        for name, new in beyond.items():
+            self._lasting.handle(Refused(name[:64], "flow", new, dropped=True), time.time_ns())
+        if beyond:
+            self._told.warn("flow: %s", self._flow.line(beyond))
 
     def _step_due(self) -> bool:
         """Make the step that is due; whether one was, so that another may be."""
@@ -368,10 +382,10 @@ class Service:
                 skipped=self._times.skipped,
                 overload=None if since is None else time.monotonic() - since,
                 busy=busy,
-                more=self._tenure.notes(),
+                more=(*self._tenure.notes(), *filter(None, [self._lasting.alarm])),
             )
-            sources = self._complaints.told(status.sources)
-            status = replace(status, sources=sources, term=self._tenure.term, standby=self._tenure.numbers())
+            status = self._complaints.told_in(self._flow.told_in(status))
+            status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
             self._put("status", encode(status))
             self._heart.beat()
         return status

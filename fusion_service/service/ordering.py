@@ -1,11 +1,12 @@
 """`OrderDesk`: where operators' orders come in, and what they are answered at once.
 
-An order is obeyed in the centre's next step. It is judged here against the picture after the last one, so that who
-ordered hears now what it will do, or why not, and under which number; what it did in fact stands under that number in
-the step log. Requests are MessagePack maps:
+An order is obeyed in the centre's next step. It is judged here against the picture after the last one: who ordered what
+cannot be obeyed hears at once why not, everybody else when the step has obeyed it and the checkpoint is on disk
+(`promises`); what it did stands under its number in the step log. Requests are MessagePack maps:
 
 none, or {"what": "list"}           -> {"orders": [...], "time": ns}: the orders that stand
-{"what": WORD, ...}                 -> {"number": n, "done": bool, "outcome": text, "track": id or nil}
+{"what": WORD, ...}                 -> {"number": n, "done": bool, "outcome": text, "track": id or nil, "kept": bool,
+                                       "pending": true where it waits for a step}
 """
 
 from __future__ import annotations
@@ -14,13 +15,14 @@ import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.centre import NEEDED, WHAT, Centre, Order, View, judge, read_order
+from fusion_service.service.promises import Promises, Reply
 from schemas import check_name, check_source
 
 __all__ = ["OrderDesk"]
@@ -38,10 +40,13 @@ class Held(NamedTuple):
 
 
 class OrderDesk:
-    """Answers orders on threads of the bus and hands them on; put: takes an order for the centre's next step."""
+    """Answers orders on threads of the bus and hands them on; put: takes an order for the centre's next step. secured:
+    who orders shows a certificate, and asks on a key of its own."""
 
-    def __init__(self, put: Callable[[Order], None]) -> None:
+    def __init__(self, put: Callable[[Order], None], secured: bool = False) -> None:
         self._put = put
+        self._secured = secured
+        self.promises = Promises()
         self._lock = threading.Lock()
         self._view = View(-1, np.zeros(0, dtype=np.uint64), {}, {})
         self._listed: list[dict[str, Any]] = []
@@ -62,6 +67,7 @@ class OrderDesk:
         """The centre has this order for its next step."""
         with self._lock:
             self._given.append(order)
+            self._next = max(self._next, order.number + 1)
 
     def again(self, whole: bool) -> list[Order]:
         """What a centre made anew is to be told: the orders of the step that failed; whole: it begins with nothing,
@@ -69,17 +75,24 @@ class OrderDesk:
         with self._lock:
             stood = [one.order for _, one in sorted(self._view.standing.items())] if whole else []
             given, self._given = self._given, []
-        return [one for one in stood + given if not whole or one.what in ("mute", "unmute", "quarantine", "release")]
+        again = [one for one in stood + given if not whole or one.what in ("mute", "unmute", "quarantine", "release")]
+        self.promises.lose(one for one in given if one not in again)
+        return again
 
-    def answer(self, payload: bytes | None, operator: str = "") -> bytes:
-        """The answer to a request. operator: whose key it came on, who is said to have ordered then, whatever the
-        request says. `ValueError` in one line where it is none."""
+    def answer(self, payload: bytes | None, reply: Reply, operator: str = "") -> None:
+        """Answer a request by `reply`, now or later. operator: whose key it came on, who is said to have ordered then,
+        whatever the request says. `ValueError` in one line where it is none."""
         raw = _map(payload)
-        if operator:
-            raw = {**raw, "who": check_name(operator)}
         if raw.get("what", "list") == "list":
             with self._lock:
-                return cast(bytes, msgpack.packb({"orders": self._listed, "time": max(self._view.time, 0)}))
+                answer = {"orders": self._listed, "time": max(self._view.time, 0)}
+            reply(msgpack.packb(answer))
+            return
+        if self._secured and not operator:
+            raise ValueError("this centre takes orders by certificate, on the key orders/OPERATOR: give --security")
+        if self.promises.full:
+            raise ValueError("too many orders wait for a step: give it again later")
+        raw = {**raw, **({"who": check_name(operator)} if operator else {}), "proven": self._secured}
         with self._lock:
             view = self._view
             order = self._read(dict(raw), view)
@@ -90,9 +103,12 @@ class OrderDesk:
                 outcome = judge(order, view)
             order = replace(order, number=self._next)
             self._next += 1
+        if outcome.done:
+            self.promises.make(order, outcome.text, reply)
         self._put(order)
-        answer = {"number": order.number, "done": outcome.done, "outcome": outcome.text, "track": order.track}
-        return cast(bytes, msgpack.packb(answer))
+        if not outcome.done:
+            refusal = {"number": order.number, "done": False, "outcome": outcome.text, "track": order.track}
+            reply(msgpack.packb({**refusal, "kept": False}))
 
     def _read(self, raw: dict[str, Any], view: View) -> Order:
         """The order of a request: tracks by any of their names, `for` seconds from the last step."""

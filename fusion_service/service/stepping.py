@@ -2,9 +2,10 @@
 
 What a step publishes waits for the disk only where a lost checkpoint would take back what was said: a track is
 confirmed, merged or split, or something other than data came in (a source, an order, an era). Ids that end are noted in
-a few bytes (`State.note_ended`), since an id that has ended never returns. Else the checkpoint is saved after
-publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the same ids, from data that are a
-second old at most; only tracks that were tentative and younger than that get new ones, of a generation of their own.
+a few bytes (`State.note_ended`), since an id that has ended never returns, and so are tracks that begin, with the local
+tracks that feed them (`young`), which begin them again under the same ids. Else the checkpoint is saved after
+publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the ids that it has published, from
+data that are a second old at most. The centre is told for how long it was not there (`Skipped`).
 """
 
 from __future__ import annotations
@@ -13,19 +14,33 @@ import dataclasses
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre import Centre, ClockSet, Event, Order, Refused, StepResult, make_centre, source_of
+from fusion_service.centre import (
+    Centre,
+    ClockSet,
+    Event,
+    LocalKey,
+    Order,
+    Refused,
+    Skipped,
+    StepResult,
+    glance,
+    make_centre,
+    source_of,
+)
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.held import HeldOrders, synced
 from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
-from schemas import Message, encode, messages
+from fusion_service.service.young import born_in, noted
+from schemas import Message, StepLog, encode, messages
 
 __all__ = ["SAVED_EVERY", "LastingCentre", "Made"]
 
@@ -74,18 +89,48 @@ class LastingCentre:
         self._desk = desk
         self._changed = False
         self._saved_at = float("-inf")
-        self._checkpoint = state.load()
-        self._ended = [state.ended()]
+        self._checkpoint = self._usable(state.load())
+        self._ended, self._born = [state.ended()], [state.born()]
+        known = glance(self._checkpoint or b"").generation
+        self._generation = state.new_generation(max(known, int(self._ended[0].max(initial=0)) >> 32))
+        self._newest = self._saved = 0
+        self._noted = b""
         self._since: list[tuple[Event, int]] = []
         self._faulty: dict[tuple[str, str, int, int], None] = {}
-        self._generation = state.new_generation()
         self.centre = self._make_centre()
         desk.follow(self.centre)
+        self._held = HeldOrders(state.folder)
+        for order in self._held.read(self.centre.orders.next):
+            log.info("order %d of before is given again: %s", order.number, order.what)
+            self.handle(order, time.time_ns())
+
+    def _usable(self, checkpoint: bytes | None) -> bytes | None:
+        """The checkpoint, but for one that is of a time to come, by more than anything is remembered: it is set aside.
+        By less it is used, and a new era begins (see `centre.era`)."""
+        ahead = glance(checkpoint or b"").time / 1e9 - time.time() - self._config.remember
+        if checkpoint is None or self._config.clock != "wall" or ahead <= 0:
+            return checkpoint
+        self._state.set_aside("ahead")
+        words = "the checkpoint is %.1f h ahead of the clock, which may be wrong: it is kept as checkpoint.ahead"
+        log.warning(words, (ahead + self._config.remember) / 3600)
+        self._state.new_generation(glance(checkpoint).generation)
+        return None
+
+    @property
+    def alarm(self) -> str:
+        """Why something is not on disk that should be; empty where all is."""
+        return self._state.trouble
 
     def _make_centre(self) -> Centre:
         epoch = max(time.time_ns(), self._state.epoch_above + 1)
+        self._slept = self._checkpoint is not None
         if self._checkpoint is not None:
-            self._checkpoint, self._ended = without(self._config, self._checkpoint, np.concatenate(self._ended)), [NONE]
+            ended, born = (
+                np.concatenate(self._ended),
+                born_in(b"".join(one.ljust(-(-len(one) // 8) * 8, b"\0") for one in self._born)),
+            )
+            self._checkpoint = without(self._config, self._checkpoint, ended, born)
+        self._ended, self._born = [NONE], [b""]
         centre, fault = make_centre(self._config, self._checkpoint, generation=self._generation, epoch=epoch)
         if fault:
             log.warning("starting without the checkpoint: %s", fault)
@@ -107,6 +152,7 @@ class LastingCentre:
     def step(self, at: int) -> Made | None:
         """Make the step at `at`, ns, saved if it must be before it is published; None where it fails even without what
         came in for it. Call `save` when it has been."""
+        unsaved = self._counts["unsaved"]
         try:
             made = self._make(at)
         except Exception:
@@ -117,7 +163,34 @@ class LastingCentre:
         finally:  # what waits for a later step may make that one fail
             self._since = [one for one in self._since if getattr(one[0], "time", -1) > at]
         self._desk.follow(self.centre)
+        self._settle(made.result.log, self._counts["unsaved"] == unsaved)
         return made
+
+    def _settle(self, journal: StepLog, saved: bool) -> None:
+        """Answer the orders of a step, whose checkpoint was `saved`."""
+        orders = [event for event in journal.events if event.get("kind") == "order"]
+        if not orders:
+            return
+        kept = saved and self._state.folder is not None
+        if kept and self._state.folder is not None:
+            try:
+                synced(self._state.folder)
+                self._held.saved(self.centre.orders.next)
+            except OSError as error:
+                kept = False
+                self._told.error("cannot keep what was ordered: %s", error)
+        self._desk.promises.settle(orders, kept)
+
+    def _hold_orders(self) -> None:
+        """Write down the orders that have waited for a step for too long, and answer them."""
+        overdue = self._desk.promises.overdue()
+        if overdue:
+            try:
+                kept = self._held.add(overdue)
+            except OSError as error:
+                kept = False
+                self._told.error("cannot keep what was ordered: %s", error)
+            self._desk.promises.hold(overdue, kept)
 
     @property
     def generation(self) -> int:
@@ -125,13 +198,15 @@ class LastingCentre:
         return self._generation
 
     def save(self, *, at_once: bool = False) -> None:
-        """Save what has changed, where that is due."""
+        """Save what has changed, where that is due, and orders that wait for a step."""
+        self._hold_orders()
         if self._changed and (at_once or time.monotonic() - self._saved_at >= SAVED_EVERY):
             self._keep(self.centre.checkpoint())
 
     def _keep(self, checkpoint: bytes) -> None:
         self._checkpoint, self._changed, self._saved_at = checkpoint, False, time.monotonic()
-        self._ended = [NONE]
+        self._ended, self._born = [NONE], [b""]
+        self._saved, self._noted = self._newest, b""
         try:
             self._state.save(checkpoint)
         except OSError as error:
@@ -140,17 +215,39 @@ class LastingCentre:
 
     def _make(self, at: int) -> Made:
         """Make a step, and all that it leaves behind, or raise with nothing left behind."""
+        self._tell_sleep(at)
         result = self.centre.step(at)
         checkpoint = self.centre.checkpoint() if _settles(result) else None
         sent = time.time_ns()
         tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
         payloads = {"tracks": encode(tracks, sound=True), "log": encode(journal, sound=True)}
         self._changed = True
+        self._newest = max(self._newest, int(result.picture.ids.max(initial=0)))
         if checkpoint is not None:
             self._keep(checkpoint)
         else:
             self._note_ended(np.array([track for track, _, _ in result.tracks.ended], dtype=np.uint64))
+            self._note_born(noted(result.picture, self._saved))
         return Made(result, payloads)
+
+    def _tell_sleep(self, at: int) -> None:
+        """The first step after a checkpoint: those between were not made."""
+        missed = (at - self.centre.time) // round(self._config.period * 1e9) - 1
+        if self._slept and self.centre.time >= 0 and missed > 0:
+            self.centre.handle(Skipped(missed), time.time_ns())
+        self._slept = False
+
+    def _note_born(self, note: bytes) -> None:
+        """Of the tracks that are not in the checkpoint, where something is new about them."""
+        if not note or note == self._noted:
+            return
+        self._noted = note
+        self._born.append(note)
+        try:
+            self._state.note_born(note)
+        except OSError as error:
+            self._counts["unsaved"] += 1
+            self._told.error("cannot note what has begun: %s", error)
 
     def _note_ended(self, ids: NDArray[np.uint64]) -> None:
         self._ended.append(ids)
@@ -158,7 +255,8 @@ class LastingCentre:
             self._state.note_ended(ids)
         except OSError as error:
             self._counts["unsaved"] += 1
-            self._told.error("cannot note what has ended: %s", error)
+            self._told.error("cannot note what has ended, so that the checkpoint is set aside: %s", error)
+            self._state.set_aside("old")
 
     def _recover(self, at: int) -> Made | None:
         """A step failed, by a fault of ours: make it from the last checkpoint, with what came in since the last one
@@ -175,7 +273,7 @@ class LastingCentre:
             return self._make(at)
         except Exception:
             self._told.error("the step at %d fails without input too: starting without the checkpoint", at)
-            self._checkpoint = None
+            self._checkpoint, self._born = None, [b""]
             self._restart()
             return None
 
@@ -238,11 +336,18 @@ def _name_of(message: Message) -> tuple[str, str, int, int]:
     return source_of(message), message.type, message.epoch, message.seq
 
 
-def without(config: CentreConfig, checkpoint: bytes, ended: NDArray[np.uint64]) -> bytes:
-    """A checkpoint without the global tracks `ended`; as it is where it holds none of them, or cannot be read."""
-    if not len(ended):
+def without(
+    config: CentreConfig, checkpoint: bytes, ended: NDArray[np.uint64], born: Sequence[tuple[LocalKey, int]] = ()
+) -> bytes:
+    """A checkpoint without the global tracks `ended`, and with the ids of those that were `born` after it; as it is
+    where there are none, or it cannot be read."""
+    over = set(ended.tolist())
+    born = [one for one in born if one[1] not in over]
+    if not len(ended) and not born:
         return checkpoint
     centre, fault = make_centre(config, checkpoint)
     if fault:
         return checkpoint
-    return centre.checkpoint() if centre.let_go(ended) else checkpoint
+    gone = centre.let_go(ended)
+    centre.promise(born)
+    return centre.checkpoint() if gone or born else checkpoint

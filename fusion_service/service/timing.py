@@ -17,14 +17,14 @@ class StepTimes:
 
     skipped: steps that were not made since the start because the service was behind, or slept: those of the wall clock
     whose time has passed; by the messages' time, where steps take longer than the time they stand for, all that are due
-    but the newest. told: how many of them were told to the centre.
+    but the newest. told: how many of them were told to the centre. authenticated: sources show certificates.
     """
 
-    def __init__(self, config: CentreConfig) -> None:
+    def __init__(self, config: CentreConfig, authenticated: bool = False) -> None:
         self._period = config.period
         self._by_messages = config.clock == "message"
-        self._arrival = ArrivalClock(config) if config.trigger == "arrival" else None
-        self._messages = MessageClock(config) if self._by_messages and self._arrival is None else None
+        self._arrival = ArrivalClock(config, authenticated) if config.trigger == "arrival" else None
+        self._messages = MessageClock(config, authenticated) if self._by_messages and self._arrival is None else None
         self._wall = WallClock(config)
         self._cost = 0.0
         self._passed = 0

@@ -47,6 +47,7 @@ def test_intervals_are_those_of_reports_taken_one_by_one(
         np.array(sorted(before), dtype=np.uint64),
         np.array([before[one][0] * SECOND for one in sorted(before)], dtype=np.int64),
         np.array([before[one][1] * SECOND for one in sorted(before)], dtype=np.int64),
+        np.zeros(len(before), dtype=np.uint64),
     )
     out = intervals(ids, times, known, PACE)
     for one in set(ids.tolist()):
@@ -72,7 +73,9 @@ def test_an_interval_rises_at_once_and_falls_by_halves_within_its_bounds() -> No
 
 
 def test_what_is_remembered_is_bounded_in_time_and_number() -> None:
-    gone = Remembered(np.arange(1, 101, dtype=np.uint64), np.arange(100, dtype=np.int64), np.full(100, 7))
+    gone = Remembered(
+        np.arange(1, 101, dtype=np.uint64), np.arange(100), np.full(100, 7), np.zeros(100, dtype=np.uint64)
+    )
     there = np.array([100], dtype=np.uint64)
     kept = remember(NOTHING_REMEMBERED, gone, there, oldest=10, most=50)
     assert kept.id.tolist() == list(range(50, 100))

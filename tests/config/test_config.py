@@ -37,7 +37,7 @@ def test_an_empty_file_is_all_defaults(tmp_path: Path) -> None:
 
 def test_the_example_is_the_defaults(tmp_path: Path) -> None:
     assert load(tmp_path, example_toml()) == ServiceConfig()
-    assert set(tomllib.loads(example_toml())) == {"centre", "bus", "service"}
+    assert set(tomllib.loads(example_toml())) == {"centre", "bus", "service", "limits"}
 
 
 def test_every_error_is_told_at_once_with_its_line(tmp_path: Path) -> None:

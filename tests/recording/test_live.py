@@ -68,7 +68,9 @@ def test_a_viewer_that_comes_late_is_shown_the_same_picture(tmp_path: Path) -> N
                 eventually(lambda: "/picture/local/radar1/ellipses" in seen() and "/grid" in seen(), 20)
             with pytest.warns(match="no footer"):
                 shown = seen()
-    recorded = {name for name in entities(tmp_path / "a.rrd") if not name.startswith(("/raw", "/__properties"))}
+    recorded = {
+        name for name in entities(tmp_path / "a.rrd") if not name.startswith(("/raw", "/seal", "/__properties"))
+    }
     assert {name for name in shown if not name.startswith("/__properties")} == recorded
     assert live.dropped == 0
 

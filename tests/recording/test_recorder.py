@@ -112,7 +112,8 @@ def test_a_file_that_ends_anywhere_gives_all_that_is_whole(tmp_path: Path, torn:
     found = [raw.data for raw in read(tmp_path / "torn.rrd")]
     count = sum(size <= whole for size in sizes)
     assert count >= len(said) - 5
-    assert found == [sent.data for sent in said[:count]]
+    assert found == [sent.data for sent in said[: len(found)]]
+    assert len(found) - count in (0, 1), "the seal of a message comes after it, and may be all that is torn"
 
 
 @pytest.mark.parametrize("torn", [0, 1, 30, 45, 60, 200, 2000, 20_000])

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fusion_service.centre import Order
+from fusion_service.centre import FusionCentre, Order
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.ordering import OrderDesk
@@ -19,6 +19,7 @@ from fusion_service.service.stepping import LastingCentre
 from tests.centre.worlds import SECOND, START, info, tracks
 from tests.helpers.processes import Hub, eventually
 from tests.helpers.scene import Scene, opened
+from tests.kills import killed
 
 
 class Made:
@@ -117,6 +118,104 @@ def test_the_rest_is_saved_once_a_second_after_publishing_and_at_the_end(
     assert made.after(at_once=True) == 1
     assert made.after(at_once=True) == 0
     assert made.again().centre.time == made.lasting.centre.time
+
+
+def goes_on(made: Made, lasting: LastingCentre, *places: float, after: float = 0.1) -> list[int]:
+    """The ids of a step of the centre that was made again, with these tracks."""
+    second = 0.1 * made.number + after
+    means: list[list[float]] = [[place, 0.0, 0.0, 0.0] for place in places]
+    ids = [1 + round(place) for place in places]
+    lasting.handle(tracks("r", second, means, ids, seq=made.number + 1), START + 100 * SECOND)
+    result = lasting.step(START + round(second * SECOND))
+    assert result is not None
+    made.result = result.result
+    return [int(one) for one in result.result.tracks.ids]
+
+
+@pytest.mark.parametrize("how", ["killed", "a step fails"])
+def test_a_track_that_began_after_the_checkpoint_has_its_id_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, how: str
+) -> None:
+    made = Made(tmp_path, monkeypatch)
+    made.step(0.0)
+    made.step(0.0)
+    assert made.step(0.0, 9000.0, 18000.0) == 0
+    ids = [int(one) for one in made.result.tracks.ids]
+    assert len(ids) == 3, "two of them are known by their note alone"
+    lasting = made.lasting
+    if how == "killed":
+        lasting = made.again()
+        assert lasting.centre.view().ids.tolist() == ids[:1]
+        assert goes_on(made, lasting, 0.0, 18000.0, 27000.0, 9000.0)[:3] == ids
+    else:
+        lasting.centre.step = None  # type: ignore[method-assign, assignment]
+        made.step(0.0, 9000.0, 18000.0)
+        assert made.counts["failed_steps"] == 1
+        assert goes_on(made, lasting, 0.0, 9000.0, 18000.0, after=0.2) == ids
+    assert made.result.tracks.ended == ()
+    twin = lasting.centre.checkpoint()
+    assert FusionCentre(made.config, twin).checkpoint() == twin
+
+
+def test_an_id_that_nobody_takes_again_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Made(tmp_path, monkeypatch)
+    made.step(0.0)
+    made.step(0.0)
+    made.step(0.0, 9000.0)
+    young = int(made.result.tracks.ids[1])
+    lasting = made.again()
+    ended = []
+    for second in range(1, 70):
+        assert young not in goes_on(made, lasting, 0.0, after=float(second))
+        ended += [track for track, _, _ in made.result.tracks.ended]
+        made.number += 1
+    assert ended.count(young) == 1
+
+
+def test_a_checkpoint_far_ahead_of_the_clock_is_set_aside_and_ids_go_on_above_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    made = Made(tmp_path, monkeypatch)
+    for _ in range(3):
+        made.step(0.0)
+    made.after(at_once=True)
+    newest = int(made.result.tracks.ids.max())
+    monkeypatch.setattr("fusion_service.service.state._by_clock", lambda: 1)
+    for back, aside in ((300, False), (86_400, True)):
+        now = made.lasting.centre.time / 1e9 - back
+        monkeypatch.setattr("fusion_service.service.stepping.time.time", lambda now=now: now)
+        again = made.again()
+        assert (again.centre.time < 0) is aside
+        assert (tmp_path / "checkpoint.ahead").exists() is aside
+        assert ("24.0 h ahead of the clock" in caplog.text) is aside
+    assert again._generation > newest >> 32
+    (tmp_path / "generation").unlink()
+    made.state.save(made.lasting.centre.checkpoint())
+    monkeypatch.setattr("fusion_service.service.stepping.time.time", lambda: 2e9)
+    assert made.again()._generation > newest >> 32
+
+
+def test_what_has_ended_and_cannot_be_noted_does_not_come_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Made(tmp_path, monkeypatch)
+    for _ in range(3):
+        made.step(0.0, 9000.0)
+
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(made.state, "note_ended", full)
+    monkeypatch.setattr(made.state, "save", full)
+    while len(made.result.tracks.ids) == 2:
+        made.step(9000.0)
+    assert made.counts["unsaved"] > 0
+    assert made.again().centre.view().ids.tolist() == []
+
+
+def test_ids_of_young_tracks_outlive_kills_at_random_moments() -> None:
+    """More of them: `python -m tests.kills`."""
+    tally = killed(2)
+    assert tally.young > 0
+    assert (tally.changed, tally.twice, tally.back) == ({}, {}, [])
 
 
 PATIENT = "confirm_hits = 1\nstale_periods = 100\ncoast_periods = 100"

@@ -161,6 +161,8 @@ class Story:
                 self.say(at, "the clock was set back: a new era began")
             elif kind == "revised" and sources & set(_listed(event.get("sources"))):
                 self.say(at, _revised(event, at))
+            elif kind in ("suspended", "resumed") and self.track in _listed(event.get("tracks")):
+                self.say(at, "suspended: all that could see it are silent" if kind == "suspended" else "back")
             elif kind in ("found", "lost") and source in sources:
                 self.say(at, f"{source} {'is on the bus' if kind == 'found' else 'has left the bus'}")
             elif kind == "order" and (whom := self._concerned(event, sources)):

@@ -1,0 +1,67 @@
+"""What is noted of tracks that begin between two checkpoints: their ids, and the local tracks that feed them.
+
+A note is its length in four bytes, MessagePack of [names of sources, global ids u64, sources u16 as indices into the
+names, epochs u64, local ids u64], columns as little-endian bytes, and a byte of 1. What a kill, or a loss of power, has
+left of the last note is passed over.
+"""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import msgpack
+import numpy as np
+
+from fusion_service.centre import LocalKey
+from schemas import GlobalTracks
+
+__all__ = ["born_in", "noted"]
+
+END = b"\x01"
+WORD = 8
+
+
+def noted(picture: GlobalTracks, above: int) -> bytes:
+    """The note of the tracks of a picture whose ids are above `above`; empty where there are none. Its ids are
+    sorted."""
+    first = int(np.searchsorted(picture.ids, np.uint64(above), side="right"))
+    if first == len(picture.ids):
+        return b""
+    counts = picture.contributor_counts.astype(np.intp)
+    begin = int(counts[:first].sum())
+    columns = (
+        np.repeat(picture.ids[first:], counts[first:]).astype("<u8"),
+        picture.contributor_source[begin:].astype("<u2"),
+        picture.contributor_epoch[begin:].astype("<u8"),
+        picture.contributor_id[begin:].astype("<u8"),
+    )
+    used, which = np.unique(columns[1], return_inverse=True)
+    names = [picture.sources[one] for one in used.tolist()]
+    parts = columns[0], which.astype("<u2"), columns[2], columns[3]
+    body = cast(bytes, msgpack.packb([names, *(part.tobytes() for part in parts)]))
+    return len(body).to_bytes(4, "little") + body + END
+
+
+def born_in(notes: bytes) -> list[tuple[LocalKey, int]]:
+    """(local track, global id) of all notes, in order; what cannot be read ends them."""
+    found: list[tuple[LocalKey, int]] = []
+    at = 0
+    while at + 4 < len(notes):
+        size = int.from_bytes(notes[at : at + 4], "little")
+        body, end = notes[at + 4 : at + 4 + size], notes[at + 4 + size : at + 5 + size]
+        if not size or end != END:
+            break
+        try:
+            found += _read(msgpack.unpackb(body))
+        except (ValueError, TypeError, IndexError, msgpack.exceptions.UnpackException):
+            break
+        at = -(-(at + 5 + size) // WORD) * WORD
+    return found
+
+
+def _read(packed: Any) -> list[tuple[LocalKey, int]]:
+    names, *parts = packed
+    kinds = ("<u8", "<u2", "<u8", "<u8")
+    tracks, sources, epochs, ids = (np.frombuffer(part, kind).tolist() for part, kind in zip(parts, kinds, strict=True))
+    rows = zip(tracks, sources, epochs, ids, strict=True)
+    return [((str(names[source]), epoch, local), track) for track, source, epoch, local in rows]
