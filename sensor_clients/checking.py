@@ -27,6 +27,8 @@ LARGEST = 2**28
 """Bytes of a file that is read."""
 WAITING = 4096
 MOST_SAID = 500
+RECENT = 60.0
+"""Seconds for which a refusal counts as one of now."""
 
 
 def check_file(path: Path) -> None:
@@ -121,6 +123,17 @@ class _Check:
         if self.said[known] == 1 and len(self.said) < MOST_SAID:
             print(line, flush=True)
 
+    def refusing(self) -> list[str]:
+        """The centres that refuse it now."""
+        return [
+            name
+            for name, said in self.centres.items()
+            if isinstance(last := said.get("last_refusal"), dict)
+            and last.get("reason") not in ("repeat", "muted")
+            and isinstance(last.get("time"), int)
+            and (time.time_ns() - last["time"]) / 1e9 < RECENT
+        ]
+
     def summary(self, alive: bool) -> list[str]:
         """What was heard, and what the centres do with it."""
         rate = self.listened.rate
@@ -132,14 +145,12 @@ class _Check:
             if not said:
                 lines.append(f"centre {centre}: has heard nothing of it")
                 continue
-            refused = said.get("refused")
-            count = sum(refused.values()) if isinstance(refused, dict) else 0
             lines.append(
-                f"centre {centre}: has taken {said.get('messages', 0)} messages, {said.get('tracks', 0)} tracks now; "
-                f"refused {count}"
+                f"centre {centre}: has taken {said.get('messages', 0)} messages, {said.get('tracks', 0)} tracks now"
             )
             last = said.get("last_refusal")
-            lines += [f"    last: ({last.get('reason')}) {last.get('said')}"] if isinstance(last, dict) else []
+            if isinstance(last, dict):
+                lines.append(f"    refused ({last.get('reason')}, {last.get('count')} times): {last.get('said')}")
             lines += [f"    {said['note']}"] if said.get("note") else []
         return lines or ["no centre is there"]
 
@@ -179,9 +190,13 @@ def check_source(
     if not check.tracks + check.infos + check.unread:
         near = f" (its token is there: {next(iter(alive))})" if there else ""
         raise HealthError(f"nothing came of {name} in {seconds:g} s, in any realm{near}: does it publish, at this hub?")
-    if not there:
+    if not there and any(name in key.split("/") for key in alive):
+        print("it went while it was listened to: its liveliness token is no more")
+    elif not there:
         check._say(f"DOUBTFUL it holds no liveliness token: declare one on {realm}/v1/local/{name}/alive", "no token")
     print("\n".join(check.summary(there)))
+    for centre in check.refusing():
+        check.said.setdefault(f"refused by {centre}", 1)
     if check.said:
         raise HealthError(f"{len(check.said)} things are wrong with {name}")
     print(f"nothing is wrong with {name}")

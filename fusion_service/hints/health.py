@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fusion_service.hints.offsets import offset_doubts
 from fusion_service.hints.times import span
 from fusion_service.source_words import source_health, state_of
 from schemas import GlobalTracks, Status
@@ -56,6 +57,8 @@ def health_of(status: Status, picture: GlobalTracks | None, now: int) -> Health:
         lines.append(_line(name, sources[name]))
         lines += [f"      {fault}" for fault in faults]
         lines += [f"      ({one})" for one in source_health(said) if not any(one in fault for fault in faults)]
+    apart = offset_doubts(picture) if picture is not None else []
+    wrong += apart
     tracks = ", ".join(f"{count} {name}" for name, count in status.tracks.items()) or "none yet"
     queue, steps = status.queue, status.step_time
     head = [
@@ -71,6 +74,7 @@ def health_of(status: Status, picture: GlobalTracks | None, now: int) -> Health:
     if standby.get("there"):
         head.append(f"  {standby['there']} stand by, {standby.get('ready', 0)} ready")
     head += [f"  note: {note}" for note in status.notes or ()]
+    head += [f"  {one}" for one in apart]
     data = {
         "centre": status.source,
         "age": (now - status.sent) / 1e9,
@@ -154,7 +158,6 @@ def _line(name: str, said: Mapping[str, Any]) -> str:
     state = "gone" if said.get("alive") is False else "silent" if said.get("stale") else "there"
     rate = number("rate", ".3g", "{} a second")
     declared = number("declared_period", ".3g", "of one every {} s")
-    refused = said.get("refused")
     parts = [
         str(said.get("state") or ""),
         f"{rate} {declared}".strip() if rate else "",
@@ -163,6 +166,5 @@ def _line(name: str, said: Mapping[str, Any]) -> str:
         number("latency", ".3g", "latency {} s"),
         number("clock", "+.2g", "clock {} s"),
         number("gaps", "d", "{} lost"),
-        f"refused {sum(refused.values())}" if isinstance(refused, dict) and refused else "",
     ]
     return f"  {name:<16} {state:<7}" + ", ".join(part for part in parts if part and part != "0 lost")

@@ -14,6 +14,9 @@ __all__ = ["refusal_finding"]
 SAME = 0.5
 """Seconds by which two delays may differ and be one."""
 
+OTHER_DAY = 7200.0
+"""Seconds from which tracks that are late and sent now are those of a mission of another time."""
+
 SAID = {
     "muted": ("", "the centre's config ignores it, or an operator has muted it: order unmute"),
     "loop": ("lineage", "it holds only what this centre has published itself: leave the centre's own picture out"),
@@ -85,6 +88,11 @@ def _time(reason: str, message: Message, now: int) -> Finding:
     if reason == "late":
         if abs(sent - off) < SAME or sent < off:
             said = f"{what} {span(off)} late and sent as late: its clock is {span(sent)} behind: {clock_words(sent)}"
+        elif off < -OTHER_DAY:
+            said = (
+                f"{what} {span(off)} late, though sent now: if it is a mission of another time, play it at today's, or "
+                f'set clock = "message" under [centre]'
+            )
         else:
             said = (
                 f"{what} {span(off)} late, and were sent {span(sent - off)} after they hold: send them sooner, or "

@@ -141,7 +141,7 @@ class Complaints:
             except Exception:  # a fault of ours, which must not hold up the service
                 self._bounds.error("what %s sends could not be looked at", name)
                 continue
-            if one.messages >= 4 and not alive.get(name) and not name.startswith("global/"):
+            if one.messages >= 4 and name not in alive and not name.startswith("global/"):
                 doubts.append(
                     "it holds no liveliness token, so that nobody hears when it is gone: declare one on its .../alive"
                 )

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import time
 
+import numpy as np
 import pytest
 
 from fusion_service.hints import key_finding, near, refusal_finding
 from fusion_service.hints.times import clock_words, span, unit_of_time
 from fusion_service.hints.words import COMPONENT_WORDS, component_hint
-from schemas import COMPONENTS, Motion, SensorInfo
+from schemas import COMPONENTS, LocalTracks, Motion, SensorInfo
 from schemas.spaces import Local
 
 NOW = time.time_ns()
@@ -77,6 +78,19 @@ def test_durations_and_clocks_in_words() -> None:
 def test_a_refusal_without_its_message_still_says_what_to_do() -> None:
     for reason in ("late", "old-epoch", "origin", "queue", "frame", "something-new"):
         assert len(refusal_finding(reason, None, NOW).said) > 20
+
+
+def test_a_mission_of_another_time_is_asked_for_its_clock() -> None:
+    info = SensorInfo(
+        source="a", epoch=1, seq=0, sent=NOW, frame=Local("h"), position=(0.0, 0.0, 0.0), period=1.0,
+        motion=Motion("cv", 1.0),
+    )  # fmt: skip
+    for seconds, words in ((8, "raise lateness"), (330 * 86400, 'clock = "message"')):
+        late = LocalTracks(
+            source="a", epoch=1, seq=0, sent=NOW, time=NOW - seconds * 10**9, complete=True, space=("x", "y"),
+            frame=info.frame, ids=np.zeros(0, np.uint64), means=np.zeros((0, 2)), covariances=np.zeros((0, 2, 2)),
+        )  # fmt: skip
+        assert words in refusal_finding("late", late, NOW).said
 
 
 def test_an_epoch_from_the_future_is_named() -> None:
