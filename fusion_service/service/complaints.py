@@ -53,6 +53,7 @@ class Complaints:
     def __init__(self, config: CentreConfig, told: BoundedLog) -> None:
         self._config = config
         self._bounds = told
+        self._often = BoundedLog(1.0)
         self._last: dict[str, dict[str, Any]] = {}
         self._waiting: dict[tuple[str, int, int, str], _Waiting] = {}
         self._bytes = 0
@@ -146,7 +147,7 @@ class Complaints:
                     "it holds no liveliness token, so that nobody hears when it is gone: declare one on its .../alive"
                 )
             for doubt in doubts:
-                if self._bounds.allows(f"{name}: {doubt[:40]}", SELDOM):
+                if self._often.allows(f"{name}: {doubt[:40]}", SELDOM):
                     self._say(f"source {name}: {doubt}")
             self._doubts[name], self._figures[name] = doubts, _figures(one)
             if time.perf_counter() - begin > THINKING:
@@ -198,7 +199,7 @@ class Complaints:
             "time": received,
             "count": count,
         }
-        if found.reason != "repeat" and self._bounds.allows(f"refused {name} {found.reason}", LOUD):
+        if found.reason != "repeat" and self._often.allows(f"refused {name} {found.reason}", LOUD):
             self._say(f"source {name}: refused ({found.reason}): {found.said}")
 
     def _say(self, line: str) -> None:
