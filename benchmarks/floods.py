@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import signal
+import socket
 import subprocess
 import sys
 import tempfile
@@ -132,8 +133,29 @@ def orders(bus: Bus) -> None:
             time.sleep(0.01)
 
 
+def connections(_: Bus) -> None:
+    """1,000 connections that say nothing, and 500 sessions that come and go beside them."""
+    endpoint = sys.argv[1]  # of the program that a flood is
+    host, port = endpoint.removeprefix("tcp/").rsplit(":", 1)
+    with ExitStack() as stack:
+        for _one in range(1000):
+            stack.enter_context(socket.create_connection((host, int(port)), timeout=10.0))
+        for _one in range(500):
+            with open_bus([endpoint], wait=30.0):
+                pass
+
+
+def queries(bus: Bus) -> None:
+    """20,000 questions for the picture, of which nobody reads the answers."""
+    for _ in range(20_000):
+        bus._session.get(schemas.global_key("centre", "picture"), lambda _: None)
+
+
 FLOODS: dict[str, Callable[[Bus], None]] = {
-    one.__name__: one for one in (names, tokens, components, mixtures, tracks, garbage, small, keys, many_names, orders)
+    one.__name__: one
+    for one in (
+        *(names, tokens, components, mixtures, tracks, garbage, small, keys, many_names, orders, connections, queries),
+    )
 }
 
 

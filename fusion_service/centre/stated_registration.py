@@ -69,7 +69,7 @@ def _shift(intake: Intake, source: Source, frame: Frame) -> Floats:
         position, given, own = stated
         covariance = np.asarray(given, dtype=np.float64).reshape(3, 3)
         _, turned = transform(np.array([position], dtype=np.float64), covariance[None], AXES, own, frame)
-        values, axes = np.linalg.eigh(0.5 * (turned[0] + turned[0].T))
+        values, axes = np.linalg.eigh(0.5 * turned[0] + 0.5 * turned[0].T)
     except (FrameError, ValueError, np.linalg.LinAlgError):
         return np.zeros((3, 3))
     if not np.isfinite(values).all():

@@ -112,7 +112,7 @@ class OrderDesk:
 
     def _read(self, raw: dict[str, Any], view: View) -> Order:
         """The order of a request: tracks by any of their names, `for` seconds from the last step."""
-        if raw["what"] not in WHAT:
+        if not isinstance(raw["what"], str) or raw["what"] not in WHAT:
             raise ValueError(f'an order is a map: {{"what": {" | ".join(WHAT)}, ...}}')
         for name in NEEDED.get(raw["what"], ()):
             if raw.get(name) is None:

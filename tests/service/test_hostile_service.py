@@ -58,6 +58,7 @@ def test_a_token_that_is_no_name(scene: Scene) -> None:
         {"what": "delete", "track": -1},
         {"what": "delete", "track": 2**64 - 1 + 1.0},
         {"what": "delete"},
+        {"what": ["delete"]},
         [],
     ],
 )
