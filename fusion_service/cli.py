@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 
+from fusion_service import __version__
 from fusion_service.commands import COMMANDS
-from fusion_service.process import exit_code, set_up_logging, stop_on_signals
+from fusion_service.process import Parser, exit_code, set_up_logging, stop_on_signals
 
 __all__ = ["main"]
 
@@ -18,13 +19,14 @@ class _Help(argparse.RawDescriptionHelpFormatter):
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="fusion-service",
         description="Associates and fuses the tracks of remote sensors into one picture.",
         epilog="Example: fusion-service demo\n"
         f"`fusion-service COMMAND --help` shows an example for each command.\n{CODES}",
         formatter_class=_Help,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", required=True)
     for name, module in COMMANDS.items():
         command = commands.add_parser(

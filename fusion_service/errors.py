@@ -11,6 +11,7 @@ FusionError                           1  the root; in `schemas.errors`, for `sch
   StateError                          1  fusion_service.service.state: the folder of ids and checkpoint
   CheckpointError         ValueError  1  fusion_service.centre.checkpoint: a checkpoint that cannot be gone on from
   DemoError                           1  fusion_service.demo: a mission that cannot be flown, or went wrong
+  HealthError                         1  what was looked at is not well, or does not answer: `status`, `listen`, `check`
   OrderError                          1  an order that a centre refuses, or that no centre hears
   ReviewError             ValueError  1  a recording, or what was asked of it
     NothingToScoreError               1  fusion_service.review.evaluation: nothing in it can be scored
@@ -33,7 +34,16 @@ from typing import ClassVar
 
 from schemas.errors import FusionError, MessageError
 
-__all__ = ["DataError", "FusionError", "MessageError", "OrderError", "ReviewError", "Stopped", "UsageError"]
+__all__ = [
+    "DataError",
+    "FusionError",
+    "HealthError",
+    "MessageError",
+    "OrderError",
+    "ReviewError",
+    "Stopped",
+    "UsageError",
+]
 
 
 class Stopped(FusionError):
@@ -46,6 +56,10 @@ class UsageError(FusionError):
     """A command cannot be carried out as it was typed; the message says how to mend it."""
 
     exit_code: ClassVar[int] = 2
+
+
+class HealthError(FusionError):
+    """What was looked at is not well; the message says how many things are wrong, and one of them."""
 
 
 class OrderError(FusionError):

@@ -10,6 +10,7 @@ import argparse
 import logging
 import math
 import os
+import re
 import signal
 import sys
 import threading
@@ -17,12 +18,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from types import FrameType
-from typing import TextIO, TypeVar, cast
+from typing import NoReturn, TextIO, TypeVar, cast
 
 from fusion_service.escape import Escaped, escaped
 
 __all__ = [
     "GRACE",
+    "Parser",
     "argument",
     "data_folder",
     "exit_code",
@@ -124,6 +126,20 @@ def exit_code(program: str, call: Callable[[], object]) -> int:
         print(escaped(f"{program}: {error}"), file=sys.stderr)
         return 1
     return 0
+
+
+class Parser(argparse.ArgumentParser):
+    """Asks whether the nearest word was meant where one is not among its choices."""
+
+    def error(self, message: str) -> NoReturn:
+        """End with the usage and `message`; exit code 2."""
+        if found := re.search(r"invalid choice: '([^']{1,64})' \(choose from (.*)\)", message):
+            import difflib
+
+            known = [one.strip(" '") for one in found[2].split(",")]
+            if near := difflib.get_close_matches(found[1], known, 1):
+                message = f"{message[: found.end(1) + 1]}: did you mean {near[0]!r}?{message[found.end(1) + 1 :]}"
+        super().error(message)
 
 
 def argument(read: Callable[[str], T]) -> Callable[[str], T]:

@@ -9,9 +9,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from fusion_service import __version__
 from fusion_service.bus import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.errors import UsageError
-from fusion_service.process import argument, data_folder, exit_code, positive, stop_on_signals, whole
+from fusion_service.process import Parser, argument, data_folder, exit_code, positive, stop_on_signals, whole
 from schemas import REALM, check_realm
 from sensor_clients.events import Event, Scenario
 from sensor_clients.faults import faulty, read_fault
@@ -33,6 +34,8 @@ EXAMPLES = """examples:
   sensor-client playback autoferry:2 --sensor ir --data /data/autoferry
   sensor-client playback radar-v2x --sensor radar --data /data
   sensor-client playback mrclam:6 --sensor robot1 --data /data
+  sensor-client check radar1                               what is wrong with it, and what the centre does with it
+  sensor-client check message.msgpack
   sensor-client playback tracks.csv --sensor radar1        what `fusion-service export` has written
 """
 
@@ -58,12 +61,13 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = Parser(
         prog="sensor-client",
         description="Publish the tracks of one simulated or recorded sensor, or the truth.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     simulate = _command(commands, "simulate", "simulate a sensor and its local tracker", EXAMPLES)
     simulate.add_argument("scenario", help="three-radars")
@@ -107,9 +111,43 @@ def _parser() -> argparse.ArgumentParser:
         command.add_argument(
             "--duration", type=argument(positive), metavar="S", help="stop after S seconds of the scenario"
         )
+    _add_check(commands)
     listing = _command(commands, "list", "scenarios, their sensors and parameters with their sources", EXAMPLES)
     listing.set_defaults(run=_list)
     return parser
+
+
+def _add_check(commands: Any) -> None:
+    checking = _command(commands, "check", "say all that is wrong with what a source sends, or with a file", EXAMPLES)
+    checking.add_argument("what", metavar="SOURCE|FILE", help="name of a source on the bus, or a file of messages")
+    checking.add_argument(
+        "--for",
+        dest="seconds",
+        type=argument(positive),
+        default=10.0,
+        metavar="S",
+        help="listen so long (default 10 s)",
+    )
+    checking.add_argument(
+        "--connect",
+        type=argument(check_endpoint),
+        default=DEFAULT_ENDPOINT,
+        help=f"the hub (default {DEFAULT_ENDPOINT})",
+    )
+    checking.add_argument("--security", type=Path, metavar="FILE", help="a certificate that may listen")
+    checking.add_argument("--realm", default=REALM, help=f"first part of every key (default {REALM})")
+    checking.set_defaults(run=_check)
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    from sensor_clients.checking import check_file, check_source
+
+    path = Path(arguments.what)
+    if path.is_file() or len(path.parts) > 1 or path.suffix in (".msgpack", ".bin", ".json"):
+        check_file(path)
+        return
+    with stop_on_signals() as stop:
+        check_source(arguments.what, arguments.connect, arguments.realm, arguments.seconds, arguments.security, stop)
 
 
 def _command(commands: Any, name: str, text: str, epilog: str) -> argparse.ArgumentParser:

@@ -23,6 +23,7 @@ STANDS_ON = {
     "schemas": set(),
     **{name: {*GROUND_FLOOR, "schemas", "fusion_service.densities"} for name in sorted(GROUND_FLOOR)},
     "fusion_service.densities": {*GROUND_FLOOR},
+    "fusion_service.hints": {*GROUND_FLOOR, "schemas"},
     "fusion_service.rules": {*GROUND_FLOOR, "fusion_service.densities"},
     "fusion_service.bus": {*GROUND_FLOOR, "schemas"},
     "fusion_service.config": {*GROUND_FLOOR, "schemas", "fusion_service.rules", "fusion_service.bus.endpoint"},
@@ -31,6 +32,7 @@ STANDS_ON = {
     },
     "fusion_service.service": {
         *(*GROUND_FLOOR, "schemas", "fusion_service.bus", "fusion_service.config", "fusion_service.centre"),
+        "fusion_service.hints",
     },
     "fusion_service.recording": {
         *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.bus", "fusion_service.config"),
@@ -39,7 +41,9 @@ STANDS_ON = {
         *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.config", "fusion_service.centre"),
         "fusion_service.recording",
     },
-    "sensor_clients": {*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.bus"},
+    "sensor_clients": {
+        *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.bus", "fusion_service.hints"),
+    },
 }
 """What each package may import of ours, beside itself and the version."""
 LONGEST_FILE = 400

@@ -32,6 +32,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "troubles",
             "standby",
             "security",
             "arrival",

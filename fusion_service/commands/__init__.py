@@ -17,12 +17,14 @@ from fusion_service.commands import (
     export,
     hub,
     keys,
+    listen,
     order,
     record,
     repair,
     replay,
     rules,
     run,
+    status,
     verify,
 )
 
@@ -30,6 +32,23 @@ __all__ = ["COMMANDS"]
 
 COMMANDS: dict[str, ModuleType] = {
     module.__name__.rpartition(".")[2]: module
-    for module in (hub, keys, run, order, record, demo, check, rules, replay, evaluate, explain, export, verify, repair)
+    for module in (
+        hub,
+        keys,
+        run,
+        status,
+        listen,
+        order,
+        record,
+        demo,
+        check,
+        rules,
+        replay,
+        evaluate,
+        explain,
+        export,
+        verify,
+        repair,
+    )
 }
 """By name, in the order of the help."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import tomllib
 from collections.abc import Iterator, Mapping
 from dataclasses import fields
@@ -83,7 +84,9 @@ def _read(kind: type[T], raw: Any, where: tuple[str, ...], problems: Problems, b
     values = {} if base is None else {name: getattr(base, name) for name in known}
     for name, value in raw.items():
         if name not in known:
-            problems.append(((*where, str(name)), f"unknown key (known: {', '.join(known)})"))
+            near = difflib.get_close_matches(str(name)[:64], known, 1)
+            meant = f": did you mean {near[0]}?" if near else ""
+            problems.append(((*where, str(name)), f"unknown key{meant} (known: {', '.join(known)})"))
             continue
         try:
             values[name] = known[name].metadata["read"](value)

@@ -33,6 +33,7 @@ from fusion_service.centre import (
 from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.complaints import Complaints
 from fusion_service.service.flow import Flow
 from fusion_service.service.heartbeat import Heartbeat
 from fusion_service.service.notify import notify
@@ -40,7 +41,7 @@ from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.overload import Overload, overtaken
 from fusion_service.service.promises import Reply
 from fusion_service.service.state import State, open_state
-from fusion_service.service.status import StatusMaker, status_line
+from fusion_service.service.status import StatusMaker, start_line, status_line
 from fusion_service.service.stepping import LastingCentre
 from fusion_service.service.succession import succeed
 from fusion_service.service.tenure import Tenure
@@ -92,6 +93,7 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
     security = maybe_security(config.bus.security)
     if security is not None:
         check_party(security, ("centre",), config.centre.name)
+    log.info("%s", start_line(config))
     with open_state(config.service.state) as state:
         join = partial(open_bus, config.bus.connect, stop=stop, security=security)
         succeed(config, state, stop, join, Service, standby)
@@ -110,6 +112,7 @@ class Service:
         self._status = StatusMaker(config.centre.name)
         self._counts = self._status.counts
         self._told = BoundedLog(config.service.log_refusals)
+        self._complaints = Complaints(config.centre, self._told)
         self._tokens = Tokens(self._inbox.wake)
         self._desk = OrderDesk(lambda order: self._inbox.put("", order), secured=config.bus.security is not None)
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
@@ -259,14 +262,19 @@ class Service:
         except ValueError as error:
             reason = error.reason if isinstance(error, MessageError) else "key"
             self._lasting.handle(Refused(name[:64], reason), item.received)
+            self._complaints.misread(name[:64], item.data, error, item.received)
             return
         if source_of(message) != name:
             self._lasting.handle(Refused(name, "source"), item.received)
+            self._complaints.misnamed(name, source_of(message), item.received)
             return
+        self._complaints.heard(name, message, len(item.data), item.received)
         self._flow.read(name, message)
         fault = ""
         if isinstance(message, (LocalTracks, LocalIntensity, GlobalTracks)):
             fault = self._times.fault(message, item.received)
+            if fault:
+                self._complaints.refused(name, fault, message, item.received)
         self._lasting.handle(Refused(name, fault) if fault else message, item.received)
 
     def _note_tokens(self) -> bool:
@@ -329,6 +337,7 @@ class Service:
         if notes and self._told.allows(notes[0], 600.0):
             log.warning("%s", "; ".join(notes))
         self._tell_sources(made.result.log)
+        self._complaints.stepped(made.result.log)
         self._result = made.result
         self._status.stepped(time.perf_counter() - begin)
         self._told.refusals(made.result.status.refused, made.result.status.dropped)
@@ -354,6 +363,7 @@ class Service:
         last = self._result.status if self._result is not None else None
         self._refused = self._lasting.centre.refusals()
         self._told.refusals(self._refused, last.dropped if last is not None else {})
+        self._complaints.think(self._tokens.told, self._result.picture.frame if self._result is not None else None)
         status = self._say_status()
         if self._overload.since is not None and status.notes:
             self._told.warn("%s", status.notes[0])
@@ -374,7 +384,7 @@ class Service:
                 busy=busy,
                 more=(*self._tenure.notes(), *filter(None, [self._lasting.alarm])),
             )
-            status = self._flow.told_in(status)
+            status = self._complaints.told_in(self._flow.told_in(status))
             status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())
             self._put("status", encode(status))
             self._heart.beat()

@@ -8,13 +8,15 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
+from fusion_service import __version__
 from fusion_service.bus import Inbox
 from fusion_service.compiled import road
+from fusion_service.config import ServiceConfig
 from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
 
-__all__ = ["StatusMaker", "status_line"]
+__all__ = ["StatusMaker", "start_line", "status_line"]
 
 SAME_CLOCK = 3600.0
 """Seconds: pictures that are older when they go out are of a mission with a clock of its own."""
@@ -134,6 +136,13 @@ def _bounded(said: Mapping[str, dict[str, Any]], alive: Mapping[str, bool]) -> d
         else:
             beyond += name not in said
     return {**sources, "*": {"more": beyond}} if beyond else sources
+
+
+def start_line(config: ServiceConfig) -> str:
+    """What starts, and where: version, centre, realm, hub, folder of the state."""
+    hub, folder = ", ".join(config.bus.connect), config.service.state or "no folder"
+    centre = f"centre {config.centre.name} of realm {config.bus.realm}"
+    return f"fusion-service {__version__}: {centre}, hub {hub}, state in {folder}"
 
 
 def status_line(status: Status) -> str:

@@ -64,7 +64,7 @@ x = 1
     told = {problem.split(": ", 2)[0]: problem for problem in caught.value.problems}
     assert {f"{path}:{line}" for line in (2, 3, 4, 5, 6, 9, 10, 13, 14)} == set(told)
     assert "must be one of: " in told[f"{path}:2"]
-    assert "unknown key (known: " in told[f"{path}:4"]
+    assert "unknown key: did you mean space? (known: " in told[f"{path}:4"]
     assert "'warp'" in told[f"{path}:5"]
     assert "centre.sources.radar1.motion: motion cv needs q" in told[f"{path}:9"]
 

@@ -1,0 +1,68 @@
+"""What is kept and said of refusals is bounded, whatever is sent, and stands in a status that can be sent."""
+
+from __future__ import annotations
+
+import logging
+import time
+
+import pytest
+
+import schemas
+from fusion_service.config import CentreConfig
+from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.complaints import MOST_BYTES, MOST_HEARD, MOST_NAMED, MOST_WAITING, Complaints
+from schemas import Status
+from tests.hints.test_tracks import NOW, message
+
+STATUS = Status(
+    source="centre", epoch=1, seq=0, sent=1, time=1, step=1, uptime=1.0, rates={}, queue={}, refused={}, dropped={},
+    sources={"a": {"alive": True}}, tracks={}, step_time={},
+)  # fmt: skip
+
+
+def complaints() -> Complaints:
+    return Complaints(CentreConfig(), BoundedLog(1.0))
+
+
+def error(data: bytes) -> schemas.MessageError:
+    with pytest.raises(schemas.MessageError) as caught:
+        schemas.decode(data)
+    return caught.value
+
+
+def test_a_flood_of_names_is_bounded_in_memory_lines_and_status(caplog: pytest.LogCaptureFixture) -> None:
+    told, fault = complaints(), error(b"{}")
+    begin = time.monotonic()
+    with caplog.at_level(logging.WARNING):
+        for k in range(5 * MOST_NAMED):
+            told.misread(f"s{k}", b"{}", fault, NOW)
+    assert len(caplog.records) <= 20 * (time.monotonic() - begin + 1)
+    assert len(told._last) == MOST_NAMED
+    status = told.told_in(STATUS)
+    assert len(status.sources) <= MOST_NAMED
+    assert schemas.decode(schemas.encode(status)).type == "status"
+
+
+def test_messages_that_wait_for_a_step_are_bounded() -> None:
+    told = complaints()
+    for k in range(2 * MOST_WAITING):
+        told.heard(f"s{k % 1000}", message(k, (0.0, 0.0)), 100, NOW)
+    assert len(told._waiting) == MOST_WAITING
+    assert len(told._heard) == MOST_HEARD
+    for k in range(10):
+        told.heard("large", message(k, (0.0, 0.0)), MOST_BYTES // 3, NOW)
+    assert told._bytes <= MOST_BYTES
+    assert told._bytes == sum(one.size for one in told._waiting.values())
+
+
+def test_the_same_refusal_is_counted_and_another_one_stands_instead() -> None:
+    told, fault = complaints(), error(b"{}")
+    for k in range(5):
+        told.misread("a", b"{}", fault, NOW + k)
+    last = told.told_in(STATUS).sources["a"]["last_refusal"]
+    assert (last["reason"], last["count"]) == ("not-msgpack", 5)
+    told.misnamed("a", "b", NOW)
+    last = told.told_in(STATUS).sources["a"]["last_refusal"]
+    assert (last["reason"], last["count"], last["value"]) == ("source", 1, "b")
+    told.refused("a", "repeat", None, NOW)
+    assert told.told_in(STATUS).sources["a"]["last_refusal"]["reason"] == "source"
