@@ -114,6 +114,8 @@ class MessageClock:
         self._now = 0
         """Time of reception that has passed, ns: between two messages at most the lead."""
         self._received = -1
+        self._latest = -1
+        """The newest time of those that came without a time of reception."""
         self._bound = -1
         self._next: int | None = None
         self._sources: dict[str, _Source] = {}
@@ -148,7 +150,7 @@ class MessageClock:
             one.epoch, one.newest, one.refused = epoch, -1, -1
             if known:
                 self._look_again()
-        self._pass(one, time, received)
+        self._pass(time, received)
         if not self._has_a_say(source):
             one.says(time, self._now, self._bound, self._voting)
             return self._take_beside(one, time)
@@ -192,10 +194,11 @@ class MessageClock:
         speak = any(one.claimed >= 0 and one.token is not False and not is_silent(one, self._now) for one in known)
         return known if speak else list(self._sources.values())
 
-    def _pass(self, one: _Source, time: int, received: int | None) -> None:
-        """Let time of reception pass until this message of `one`."""
+    def _pass(self, time: int, received: int | None) -> None:
+        """Let time of reception pass until this message."""
         if received is None:
-            self._now += min(max(time - one.claimed, 0), self._period) if one.claimed >= 0 else 0
+            self._now += min(max(time - self._latest, 0), self._period) if self._latest >= 0 else 0
+            self._latest = max(time, self._latest)
         else:
             self._now += min(max(received - self._received, 0), self._lead) if self._received >= 0 else 0
             self._received = received

@@ -329,7 +329,8 @@ def test_nothing_and_nonsense_are_taken() -> None:
     made = centre(THREE)
     made.handle(info("r9"), START)
     results = fly(made, ("r1",), honest, range(1, 3))
-    assert results[-1].status.sources["r9"]["state"] == "trusted"
+    assert results[-1].status.sources["r9"]["resting"], "it has said nothing but its info"
+    assert results[-1].status.sources["r1"]["state"] == "trusted"
 
 
 def test_states_go_up_at_once_and_down_when_it_is_calm() -> None:
