@@ -84,8 +84,8 @@ def named(config: CentreConfig) -> frozenset[str] | None:
 
 
 def first_pace(rule: Voting) -> int:
-    """What is taken for the pace of who was heard once, or not yet: it is silent after `lateness`, or a period, and half
-    of that, so that its second word may come a little after those of others."""
+    """What is taken for the pace of who was heard once, or not yet: it is silent after `lateness`, or a period, and
+    half of that, so that its second word may come a little after those of others."""
     return max(rule.period, rule.lateness) // 2
 
 

@@ -35,8 +35,17 @@ def honest(found: Mapping[str, Score]) -> None:
         assert score.worst <= 1.05 + 3 * score.error, (name, score)
 
 
+SLOW = pytest.mark.slow
+
+
 @pytest.mark.parametrize(
-    ("graph", "steps"), [pytest.param("pair", 300, marks=pytest.mark.slow), ("pair", 120), ("tree", 120), ("ring", 120)]
+    ("graph", "steps"),
+    [
+        pytest.param("pair", 300, marks=SLOW),
+        ("pair", 120),
+        pytest.param("tree", 120, marks=SLOW),
+        pytest.param("ring", 120, marks=SLOW),
+    ],
 )
 def test_every_centre_is_honest_and_no_worse_than_alone(graph: str, steps: int) -> None:
     """Unequal sensors: what one centre sees badly the other sees well."""
@@ -52,7 +61,7 @@ def test_every_centre_is_honest_and_no_worse_than_alone(graph: str, steps: int) 
         assert together["A"].rmse < 0.75 * alone["A"].rmse, "it hears nothing"
 
 
-@pytest.mark.parametrize("graph", ["tree", "mesh"])
+@pytest.mark.parametrize("graph", ["tree", pytest.param("mesh", marks=SLOW)])
 def test_a_rule_for_independent_tracks_counts_nothing_twice(graph: str) -> None:
     """Sensors that say a new, independent measurement each time: the naive rule is exact for one centre, and, where
     pictures do not say what is in them, far too sure for three."""

@@ -16,7 +16,7 @@ STUDIES = catalogue()
 DATA = data_folder("autoferry")
 
 
-LONG = {"autoferry", "li-nonlinear", "sharma-three-radars", "tracklets", "unequal-sensors"}
+LONG = {"autoferry", "dubey-consensus", "li-nonlinear", "sharma-three-radars", "tracklets", "unequal-sensors"}
 """Tens of seconds each, for they fly whole missions: `make slow-test`."""
 
 
