@@ -35,6 +35,9 @@ def columns_of(record: Any) -> tuple[Any, ...]:
 @cache
 def _places(kind: Any, changed: tuple[str, ...]) -> tuple[int, ...]:
     names = names_of(kind)
+    for name in changed:
+        if name not in names:
+            raise TypeError(f"{kind.__name__} has no field {name}")
     return tuple(names.index(name) for name in changed)
 
 

@@ -108,7 +108,7 @@ def test_a_centre_that_loses_honest_targets_is_found(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(FusionCentre, "handle", losing)
     monkeypatch.setattr(centres, "drawn", lambda _: centre_config({}))
-    assert "are not in the picture" in str(centres.fuzz_centres(3, FOREVER, 1))
+    assert "are not in the picture" in str(centres.fuzz_centres(1, FOREVER, 2))
 
 
 def test_every_part_has_a_name() -> None:
