@@ -39,6 +39,8 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     before = watch.pictures[-1].targets
     assert main(["order", "rename", "--track", str(before[2]), "--name", "PILOT", "--connect", hub.endpoint]) == 0
     eventually(lambda: "PILOT" in (watch.pictures[-1].picture.callsign or ()))
+    shown = len(watch.pictures)  # the log of a step comes after its picture: what it obeys is the other's with the next
+    eventually(lambda: len(watch.pictures) >= shown + 2)
 
     first.kill()
     killed = time.monotonic()
@@ -62,8 +64,11 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     eventually(watch.ready, 20)  # it stood down, and stands by
     eventually(lambda: pair.active() == 0)
 
-    number = len(watch.pictures) - 1
-    assert main(["order", "handover", "--connect", hub.endpoint]) == 0
+    for _ in range(20):  # once the other is in step
+        number = len(watch.pictures) - 1
+        if main(["order", "handover", "--connect", hub.endpoint]) == 0:
+            break
+        time.sleep(0.5)
     seen = pair.taken_over(number)
     assert seen.targets == before
     assert seen.picture.time - watch.pictures[number].picture.time < 1.2e9
