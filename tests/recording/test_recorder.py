@@ -205,7 +205,8 @@ def test_a_recorder_that_is_killed_or_stopped_leaves_all_it_wrote(
             pass
         token.close()
         done = time.time_ns()
-        program.line()
+        for _ in range(4):  # that the token is gone comes by itself, and is in no count
+            program.line()
         stopped = time.monotonic()
         program.signal(end)
         program.end()
