@@ -243,3 +243,5 @@ def test_an_id_that_was_seen_once_is_kept_however_soon_the_service_is_killed(sce
     born = scene.seen.born()  # the log of the last step before the kill may not have gone out
     assert len(born) == len(set(born))
     assert set(born) <= set(ids.values())
+    assert {int(track) for picture in scene.seen.pictures for track in picture.ids} == set(ids.values())
+    assert len(set(ids.values())) == 2
