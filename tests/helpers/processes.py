@@ -26,7 +26,7 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{server.getsockname()[1]}"
 
 
-def eventually(condition: Callable[[], object], timeout: float = 5.0) -> float:
+def eventually(condition: Callable[[], object], timeout: float = 20.0) -> float:
     """Wait until `condition()` holds; the seconds it took. Fails after `timeout`."""
     begin = time.monotonic()
     while not condition():
