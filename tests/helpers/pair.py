@@ -61,9 +61,27 @@ class Watch:
     def sees(self, *targets: int) -> bool:
         return bool(self.pictures) and sorted(self.pictures[-1].targets) == sorted(targets)
 
+    def taken_over(self, since: int, timeout: float = 10.0) -> Seen:
+        """The first picture of another run than that of number `since` of the pictures."""
+        epoch = self.pictures[since].picture.epoch
+        found: list[Seen] = []
+
+        def there() -> bool:
+            found.extend(one for one in self.pictures[since:] if one.picture.epoch != epoch)
+            return bool(found)
+
+        eventually(there, timeout)
+        return found[0]
+
     def ready(self) -> bool:
         """Whether the active one says that another could take over."""
         return self.status is not None and bool(self.status.standby and self.status.standby["ready"])
+
+    def term(self) -> int:
+        """Of whoever is active."""
+        assert self.status is not None
+        assert self.status.term is not None
+        return self.status.term
 
     def names(self) -> dict[int, set[int]]:
         """Every global id that was ever confirmed -> the targets it was shown at."""
@@ -130,18 +148,8 @@ class Pair:
 
     def active(self) -> int:
         """Which of the two is active, by the parity of its term's node: they are 0 and 1."""
-        assert self.watch.status is not None
-        assert self.watch.status.term is not None
-        return self.watch.status.term % 4
+        return self.watch.term() % 4
 
     def taken_over(self, since: int, timeout: float = 10.0) -> Seen:
-        """The first picture of another run than that of number `since` of the pictures."""
-        epoch = self.watch.pictures[since].picture.epoch
-        found: list[Seen] = []
-
-        def there() -> bool:
-            found.extend(one for one in self.watch.pictures[since:] if one.picture.epoch != epoch)
-            return bool(found)
-
-        eventually(there, timeout)
-        return found[0]
+        """The first picture of another run than that of number `since` of the pictures, at the first hub."""
+        return self.watch.taken_over(since, timeout)

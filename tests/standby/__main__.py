@@ -4,6 +4,10 @@ One mission of a centre of two processes, a hub and three sensors of 24 targets 
 killed (and started again, so that it stands by), frozen and thawed, or told to hand over. Printed: seconds from that to
 the first picture of the other process, seconds between the last picture before and the first after, and every id that
 changed, was given twice, came back, or had a picture of the old run after one of the new.
+
+`--what partition` has two hubs, one process of the centre at each, and a third hub between them that is killed, and
+started again some seconds later: seconds from that to the first picture of the other process at its hub, and from the
+start of the hub until both sides have the pictures of one process and the other stands by again.
 """
 
 from __future__ import annotations
@@ -20,7 +24,8 @@ from pathlib import Path
 
 from fusion_service.cli import main as command
 from fusion_service.compiled.road import VARIABLE
-from tests.helpers.pair import Pair
+from tests.helpers.link import Between
+from tests.helpers.pair import Pair, Watch
 from tests.helpers.processes import Hub, eventually
 
 SENSORS = {"r1": range(16), "r2": range(8, 24), "r3": range(4, 20)}
@@ -33,6 +38,7 @@ class Mission:
     def __init__(self, hub: Hub, folder: Path, stack: ExitStack, frozen: float) -> None:
         self._endpoint, self._frozen = hub.endpoint, frozen
         self.pair = Pair((hub.endpoint, hub.endpoint), folder, stack)
+        self.watches = (self.pair.watch,)
         for name, targets in SENSORS.items():
             self.pair.sensor(name, *targets)
         self.pair.started(*TARGETS)
@@ -67,10 +73,54 @@ class Mission:
         return first.at - begin, first.at - last.at, changed
 
 
+class Parted:
+    """A centre of two, each at a hub of its own, and what came of killing the hub between them. healed: seconds until
+    all was as before; alone: pictures that the one that was active published meanwhile."""
+
+    def __init__(self, folder: Path, stack: ExitStack) -> None:
+        self._hubs = stack.enter_context(Between())
+        self.pair = Pair(self._hubs.endpoints, folder, stack)
+        self.watches = self.pair.watch, Watch(self._hubs.endpoints[1], stack)
+        self.healed: list[float] = []
+        self.alone: list[int] = []
+        self.pair.sensor("r1", *range(16))
+        self.pair.sensor("r2", *range(8, 24))
+        self.pair.sensor("r3", *TARGETS, hub=1)
+        self.pair.started(*TARGETS)
+
+    def once(self, what: str) -> tuple[float, float, int]:
+        for watch in self.watches:
+            eventually(watch.ready, 60)
+            eventually(lambda watch=watch: watch.sees(*TARGETS), 20)  # type: ignore[misc]
+        time.sleep(random.uniform(0.0, 0.5))
+        which = self.pair.active()
+        here, there = self.watches[which], self.watches[1 - which]
+        before, number = there.pictures[-1].targets, len(there.pictures) - 1
+        begin = time.monotonic()
+        self._hubs.cut()
+        count = len(here.pictures)
+        first = there.taken_over(number, 30.0)
+        last = [one for one in there.pictures[number:] if one.picture.epoch != first.picture.epoch][-1]
+        time.sleep(random.uniform(1.0, 4.0))
+        self.alone.append(len(here.pictures) - count)
+        epoch = first.picture.epoch
+        mended = time.monotonic()
+        self._hubs.mend()
+        eventually(
+            lambda: all(one.pictures[-1].picture.epoch == epoch and one.sees(*TARGETS) for one in self.watches), 60
+        )
+        eventually(lambda: all(one.ready() and one.term() == there.term() for one in self.watches), 60)
+        self.healed.append(time.monotonic() - mended)
+        changed = sum(there.pictures[-1].targets.get(target) != track for target, track in before.items())
+        return first.at - begin, first.at - last.at, changed
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=10, help="of each (default 10)")
-    parser.add_argument("--what", nargs="+", default=["kill", "freeze", "handover"])
+    parser.add_argument(
+        "--what", nargs="+", default=["kill", "freeze", "handover"], help="these, or partition, which has its own hubs"
+    )
     parser.add_argument(
         "--frozen", type=float, default=3.0, metavar="S", help="how long a frozen one stays so (default 3)"
     )
@@ -78,25 +128,47 @@ def main() -> None:
     os.environ[VARIABLE] = "off"  # a process that is killed while it compiles leaves the next one to wait for that
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
-        hub = Hub().start()
-        stack.callback(hub.kill)
-        mission = Mission(hub, Path(folder), stack, args.frozen)
+        mission: Mission | Parted
+        if args.what == ["partition"]:
+            mission = Parted(Path(folder), stack)
+        else:
+            hub = Hub().start()
+            stack.callback(hub.kill)
+            mission = Mission(hub, Path(folder), stack, args.frozen)
         for what in args.what:
-            try:
-                rows = [mission.once(what) for _ in range(args.times)]
-            except AssertionError:
-                print(*(one.told() for one in mission.pair.programs if one is not None), sep="\n--\n")
-                raise
-            took, gaps, changed = zip(*rows, strict=True)
-            print(
-                f"{what:9} {len(rows):4} times: picture of the other after {statistics.median(took):.2f} s (median), "
-                f"{max(took):.2f} s (worst); gap in pictures {statistics.median(gaps):.2f} s, {max(gaps):.2f} s; "
-                f"ids changed: {sum(changed)} of {len(rows) * len(TARGETS)}",
-                flush=True,
-            )
-        faults = mission.pair.watch.faults()
-        print(f"{len(mission.pair.watch.pictures)} pictures; faults: {len(faults)}", *faults[:20], sep="\n  ")
+            _told(mission, what, args.times)
+        faults = [one for watch in mission.watches for one in watch.faults()]
+        pictures = sum(len(watch.pictures) for watch in mission.watches)
+        older = [one for one in faults if one.startswith("a picture of run")]
+        print(f"{pictures} pictures; of an older run after a newer one: {len(older)}", end="; ")
+        print(f"other faults: {len(faults) - len(older)}")
+        print(*older[:5], *[one for one in faults if one not in older][:20], sep="\n  ")
         print(f"load average {load:.1f} to {os.getloadavg()[0]:.1f}")
+
+
+def _told(mission: Mission | Parted, what: str, times: int) -> None:
+    """Do it so often, and print what came of it."""
+    rows: list[tuple[float, float, int]] = []
+    try:
+        while len(rows) < times:
+            rows.append(mission.once(what))
+    except AssertionError:
+        print(f"{what}: after {len(rows)} times", *(one.told() for one in mission.pair.programs if one), sep="\n--\n")
+        raise
+    took, gaps, changed = zip(*rows, strict=True)
+    print(
+        f"{what:9} {len(rows):4} times: picture of the other after {statistics.median(took):.2f} s (median), "
+        f"{max(took):.2f} s (worst); gap in pictures {statistics.median(gaps):.2f} s, {max(gaps):.2f} s; "
+        f"ids changed: {sum(changed)} of {len(rows) * len(TARGETS)}",
+        flush=True,
+    )
+    if isinstance(mission, Parted):
+        healed = mission.healed
+        print(
+            f"whole again after {statistics.median(healed):.2f} s (median), {max(healed):.2f} s (worst); "
+            f"pictures of the other side meanwhile: {min(mission.alone)} at least, {sum(mission.alone)} in all",
+            flush=True,
+        )
 
 
 if __name__ == "__main__":
