@@ -43,7 +43,7 @@ from fusion_service.service.promises import Reply
 from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker, start_line, status_line
 from fusion_service.service.stepping import LastingCentre
-from fusion_service.service.succession import succeed
+from fusion_service.service.succession import Process, succeed
 from fusion_service.service.tenure import Tenure
 from fusion_service.service.timing import StepTimes
 from fusion_service.service.tokens import Tokens
@@ -96,7 +96,7 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
     log.info("%s", start_line(config))
     with open_state(config.service.state) as state:
         join = partial(open_bus, config.bus.connect, stop=stop, security=security)
-        succeed(config, state, stop, join, Service, standby)
+        succeed(Process(config, state, stop, join, Service), standby)
 
 
 class Service:
@@ -116,7 +116,7 @@ class Service:
         self._tokens = Tokens(self._inbox.wake)
         self._desk = OrderDesk(lambda order: self._inbox.put("", order), secured=config.bus.security is not None)
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
-        self._desk.promises.may = self._tenure.may_publish
+        self._tenure.vouch(self._desk.promises)
         self._times = StepTimes(config.centre, authenticated=config.bus.security is not None)
         self._flow = Flow(config.limits)
         self._overload = Overload(self._times.patience)
@@ -214,6 +214,7 @@ class Service:
     def _on_sample(self, key: str, data: bytes) -> None:
         scope, name, _ = key.rsplit("/", 3)[-3:]
         source = centre_source(name) if scope == "global" else name
+        self._tenure.hears()
         if self._flow.takes(source, len(data)):
             self._inbox.put(source, Arrival(key, data, time.time_ns()), len(data))
 
@@ -222,9 +223,7 @@ class Service:
 
     def _on_order(self, payload: bytes | None, reply: Reply, operator: str = "") -> None:
         may = bool(operator) or self._config.bus.security is None
-        if may and (answer := self._tenure.ordered(payload, operator)) is not None:
-            reply(answer)
-        else:
+        if not (may and self._tenure.ordered(payload, operator, reply)):
             self._desk.answer(payload, reply, operator)
 
     def _on_picture(self, payload: bytes | None) -> bytes:
@@ -329,8 +328,8 @@ class Service:
         self._times.made(time.perf_counter() - begin)
         if made is None:
             return
-        for what, payload in made.messages.items():
-            self._put(what, payload)
+        for what in self._tenure.order:
+            self._put(what, made.messages[what])
         self._tenure.stepped(made.result.log.step, at, self._lasting.centre.epoch, self._lasting.generation)
         self._status.published(at, time.time_ns())
         notes = made.result.status.notes

@@ -35,7 +35,7 @@ from fusion_service.centre import (
 )
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
-from fusion_service.service.held import HeldOrders, synced
+from fusion_service.service.held import synced
 from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
@@ -99,9 +99,10 @@ class LastingCentre:
         self._faulty: dict[tuple[str, str, int, int], None] = {}
         self.centre = self._make_centre()
         desk.follow(self.centre)
-        self._held = HeldOrders(state.folder)
+        self._held = state.held
         for order in self._held.read(self.centre.orders.next):
             log.info("order %d of before is given again: %s", order.number, order.what)
+            desk.promises.wait_for(order)
             self.handle(order, time.time_ns())
 
     def _usable(self, checkpoint: bytes | None) -> bytes | None:
@@ -167,7 +168,7 @@ class LastingCentre:
         return made
 
     def _settle(self, journal: StepLog, saved: bool) -> None:
-        """Answer the orders of a step, whose checkpoint was `saved`."""
+        """Let the orders of a step be answered, whose checkpoint was `saved`, once it is published."""
         orders = [event for event in journal.events if event.get("kind") == "order"]
         if not orders:
             return
@@ -182,7 +183,7 @@ class LastingCentre:
         self._desk.promises.settle(orders, kept)
 
     def _hold_orders(self) -> None:
-        """Write down the orders that have waited for a step for too long, and answer them."""
+        """Write down the orders that have waited for a step for too long, and answer what may be answered."""
         overdue = self._desk.promises.overdue()
         if overdue:
             try:
@@ -191,6 +192,7 @@ class LastingCentre:
                 kept = False
                 self._told.error("cannot keep what was ordered: %s", error)
             self._desk.promises.hold(overdue, kept)
+        self._desk.promises.release()
 
     @property
     def generation(self) -> int:

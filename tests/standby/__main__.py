@@ -125,6 +125,7 @@ def main() -> None:
         "--frozen", type=float, default=3.0, metavar="S", help="how long a frozen one stays so (default 3)"
     )
     args = parser.parse_args()
+    os.environ["PYTHONFAULTHANDLER"] = "1"
     os.environ[VARIABLE] = "off"  # a process that is killed while it compiles leaves the next one to wait for that
     load = os.getloadavg()[0]
     with tempfile.TemporaryDirectory() as folder, ExitStack() as stack:
@@ -153,7 +154,10 @@ def _told(mission: Mission | Parted, what: str, times: int) -> None:
         while len(rows) < times:
             rows.append(mission.once(what))
     except AssertionError:
-        print(f"{what}: after {len(rows)} times", *(one.told() for one in mission.pair.programs if one), sep="\n--\n")
+        running = [one for one in mission.pair.programs if one]
+        for one in running:
+            one.signal(signal.SIGABRT)  # where its threads are
+        print(f"{what}: after {len(rows)} times", *(one.end()[1] for one in running), sep="\n--\n")
         raise
     took, gaps, changed = zip(*rows, strict=True)
     print(
