@@ -23,11 +23,14 @@ from typing import NoReturn, TextIO, TypeVar, cast
 from fusion_service.escape import Escaped, escaped
 
 __all__ = [
+    "ABANDONED",
     "GRACE",
     "Parser",
     "argument",
     "data_folder",
     "exit_code",
+    "left_behind",
+    "loading",
     "positive",
     "set_up_logging",
     "stop_on_signals",
@@ -38,6 +41,10 @@ T = TypeVar("T")
 
 GRACE = 4.0
 """Seconds after the first signal in which a process must have ended by itself."""
+ABANDONED = "compiler"
+"""The name of a thread that nobody waits for when all else has ended: it may be in one call for a minute."""
+
+_LOADING = threading.Event()
 
 
 class _JsonFormatter(logging.Formatter):
@@ -84,6 +91,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
             os._exit(1)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
+        if _LOADING.is_set():
+            os._exit(0)
         for one in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
             signal.signal(one, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, GRACE + 0.5)
@@ -102,6 +111,27 @@ def stop_on_signals() -> Iterator[threading.Event]:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """While it lasts nothing is open that must be closed: the first signal ends the process at once, with 0. For what
+    takes long to load, in the main thread."""
+    _LOADING.set()
+    try:
+        yield
+    finally:
+        _LOADING.clear()
+
+
+def left_behind(code: int) -> int:
+    """`code`; but where an `ABANDONED` thread is at work, the process ends with it at once. For who has closed all."""
+    if any(one.name == ABANDONED for one in threading.enumerate()):
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 def exit_code(program: str, call: Callable[[], object]) -> int:

@@ -1,7 +1,7 @@
 """`Handover`: an operator's order to the active process to let the one that stands by go on.
 
-It waits until one that stands by is in step, `PATIENCE` seconds at most, or until one is there, `NOBODY` seconds, and is
-answered when that one has taken over, or with why not.
+It waits until one that stands by is in step, `PATIENCE` seconds at most, or until one is there, `NOBODY` seconds, and
+is answered when that one has taken over, or with why not.
 """
 
 from __future__ import annotations

@@ -68,7 +68,8 @@ def test_a_handover_waits_until_one_is_in_step_and_says_why_if_none_is() -> None
     clock, said = Clock(), list[Any]()
     handover = Handover(clock)
     order = msgpack.packb({"what": "handover", "who": "anna"})
-    for other in (None, b"", b"handover", msgpack.packb(["handover"]), msgpack.packb({"what": "list", "x": "handover"})):
+    listed = msgpack.packb({"what": "list", "who": "handover"})
+    for other in (None, b"", b"handover", msgpack.packb(["handover"]), listed):
         assert not handover.take(other, "", said.append)
     assert not handover.due({"b": ""}), "nobody asked"
 

@@ -5,6 +5,10 @@ killed (and started again, so that it stands by), frozen and thawed, or told to 
 the first picture of the other process, seconds between the last picture before and the first after, and every id that
 changed, was given twice, came back, or had a picture of the old run after one of the new.
 
+`--what order` kills the active one at once after it has answered an order, `--what pending` (by the clock of messages,
+with sensors that are frozen meanwhile) after one that waits for a step: does it stand at the other one? What is not
+there is a fault.
+
 `--what partition` has two hubs, one process of the centre at each, and a third hub between them that is killed, and
 started again some seconds later: seconds from that to the first picture of the other process at its hub, and from the
 start of the hub until both sides have the pictures of one process and the other stands by again.
@@ -22,6 +26,9 @@ import time
 from contextlib import ExitStack
 from pathlib import Path
 
+import msgpack
+
+import schemas
 from fusion_service.cli import main as command
 from fusion_service.compiled.road import VARIABLE
 from tests.helpers.link import Between
@@ -33,15 +40,36 @@ TARGETS = range(24)
 
 
 class Mission:
-    """A centre of two, and what came of doing something to the active one. rows: (seconds, gap, ids changed)."""
+    """A centre of two, and what came of doing something to the active one. rows: (seconds, gap, ids changed). lost:
+    orders that were answered and did not stand; answered: seconds until they were."""
 
-    def __init__(self, hub: Hub, folder: Path, stack: ExitStack, frozen: float) -> None:
+    def __init__(self, hub: Hub, folder: Path, stack: ExitStack, frozen: float, centre: str = "") -> None:
         self._endpoint, self._frozen = hub.endpoint, frozen
-        self.pair = Pair((hub.endpoint, hub.endpoint), folder, stack)
+        self.pair = Pair((hub.endpoint, hub.endpoint), folder, stack, centre)
         self.watches = (self.pair.watch,)
-        for name, targets in SENSORS.items():
-            self.pair.sensor(name, *targets)
+        self._sensors = [self.pair.sensor(name, *targets) for name, targets in SENSORS.items()]
+        self.lost: list[str] = []
+        self.answered: list[float] = []
         self.pair.started(*TARGETS)
+
+    def _order(self, track: int, what: str) -> str:
+        """Give a track a new name, and return that once it is answered, by a step or as one that waits for one."""
+        if what == "pending":
+            for one in self._sensors:
+                one.freeze()
+            time.sleep(0.5)
+        name = f"N{len(self.answered)}"
+        asked = msgpack.packb({"what": "rename", "track": track, "name": name})
+        begin = time.monotonic()
+        [(_, data)] = self.pair.watch.bus.ask(schemas.global_key("centre", "orders"), asked, 10.0)
+        self.answered.append(time.monotonic() - begin)
+        answer = msgpack.unpackb(data)
+        assert answer["done"], answer
+        assert answer["kept"], answer
+        assert answer.get("pending", False) == (what == "pending"), answer
+        if "followed" in answer:
+            self.lost.append(f"{name} was answered as not followed")
+        return name
 
     def once(self, what: str) -> tuple[float, float, int]:
         watch = self.pair.watch
@@ -52,18 +80,25 @@ class Mission:
         program = self.pair.programs[which]
         assert program is not None
         before, number = watch.pictures[-1].targets, len(watch.pictures) - 1
+        name = self._order(before[7], what) if what in ("order", "pending") else ""
         begin = time.monotonic()
-        if what == "kill":
+        if what in ("kill", "order", "pending"):
             program.kill()
         elif what == "freeze":
             program.freeze()
         else:
             assert command(["order", "handover", "--connect", self._endpoint]) == 0
+        if what == "pending":
+            eventually(lambda: watch.status and watch.term() % 4 != which, 20)
+            for one in self._sensors:
+                one.signal(signal.SIGCONT)
         first = self.pair.taken_over(number, 30.0)
         last = [one for one in watch.pictures[number:] if one.picture.epoch != first.picture.epoch][-1]
         time.sleep(1.0)
+        if name and name not in (watch.pictures[-1].picture.callsign or ()):
+            self.lost.append(f"{name} does not stand")
         changed = sum(watch.pictures[-1].targets.get(target) != track for target, track in before.items())
-        if what == "kill":
+        if what in ("kill", "order", "pending"):
             program.__exit__()
             self.pair.centre(which)
         elif what == "freeze":
@@ -119,7 +154,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--times", type=int, default=10, help="of each (default 10)")
     parser.add_argument(
-        "--what", nargs="+", default=["kill", "freeze", "handover"], help="these, or partition, which has its own hubs"
+        "--what",
+        nargs="+",
+        default=["kill", "freeze", "handover"],
+        help="kill, freeze, handover, order; or one of partition and pending alone",
     )
     parser.add_argument(
         "--frozen", type=float, default=3.0, metavar="S", help="how long a frozen one stays so (default 3)"
@@ -135,7 +173,8 @@ def main() -> None:
         else:
             hub = Hub().start()
             stack.callback(hub.kill)
-            mission = Mission(hub, Path(folder), stack, args.frozen)
+            pending = 'clock = "message"\n' if args.what == ["pending"] else ""
+            mission = Mission(hub, Path(folder), stack, args.frozen, pending)
         for what in args.what:
             _told(mission, what, args.times)
         faults = [one for watch in mission.watches for one in watch.faults()]
@@ -166,6 +205,10 @@ def _told(mission: Mission | Parted, what: str, times: int) -> None:
         f"ids changed: {sum(changed)} of {len(rows) * len(TARGETS)}",
         flush=True,
     )
+    if isinstance(mission, Mission) and mission.answered:
+        answered = mission.answered
+        print(f"orders lost: {len(mission.lost)} of {len(answered)}", *mission.lost[:20], sep="\n  ")
+        print(f"answered after {statistics.median(answered):.2f} s (median), {max(answered):.2f} s (worst)")
     if isinstance(mission, Parted):
         healed = mission.healed
         print(
