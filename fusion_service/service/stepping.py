@@ -1,10 +1,10 @@
 """A centre that goes on whatever happens: it is made from its checkpoint, and made again from it should a step fail.
 
 What a step publishes waits for the disk only where a lost checkpoint would take back what was said: a track is
-confirmed, merged or split, or something other than data came in (a source, an order, an era). Ids that end are noted in
-a few bytes (`State.note_ended`), since an id that has ended never returns, and so are tracks that begin, with the local
-tracks that feed them (`young`), which begin them again under the same ids. Else the checkpoint is saved after
-publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the ids that it has published, from
+confirmed, merged or split, one of an intensity begins, or something other than data came in (a source, an order, an
+era). Ids that end are noted in a few bytes (`State.note_ended`), since an id that has ended never returns, and so are
+tracks that begin, with the local tracks that feed them (`young`), which begin them again under the same ids. Else the
+checkpoint is saved after publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the ids that it has published, from
 data that are a second old at most. The centre is told for how long it was not there (`Skipped`).
 """
 
@@ -219,7 +219,7 @@ class LastingCentre:
         """Make a step, and all that it leaves behind, or raise with nothing left behind."""
         self._tell_sleep(at)
         result = self.centre.step(at)
-        checkpoint = self.centre.checkpoint() if _settles(result) else None
+        checkpoint = self.centre.checkpoint() if _settles(result, self._config.kind) else None
         sent = time.time_ns()
         tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
         payloads = {"tracks": encode(tracks, sound=True), "log": encode(journal, sound=True)}
@@ -326,11 +326,14 @@ class LastingCentre:
             self.centre.handle(order, time.time_ns())
 
 
-def _settles(result: StepResult) -> bool:
-    """Whether a step says something, or obeys something, that a centre made anew must know."""
+def _settles(result: StepResult, kind: str) -> bool:
+    """Whether a step says something, or obeys something, that a centre made anew must know. Tracks of an intensity have
+    no local tracks by which a note could tell them."""
     picture, log = result.tracks, result.log
     merged = any(heir is not None for _, _, heir in picture.ended)
-    return bool(merged or picture.split_from or log.events or (log.decisions.kind == messages.CONFIRMED_NOW).any())
+    known = messages.BORN if kind == "intensity" else messages.CONFIRMED_NOW
+    began = np.isin(log.decisions.kind, (known, messages.CONFIRMED_NOW)).any()
+    return bool(merged or picture.split_from or log.events or began)
 
 
 def _name_of(message: Message) -> tuple[str, str, int, int]:
