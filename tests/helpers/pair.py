@@ -121,9 +121,9 @@ class Pair:
         self.programs: list[Program | None] = [None, None]
         self.watch = Watch(endpoints[0], stack)
 
-    def sensor(self, name: str, *targets: int, hub: int = 0) -> Program:
-        arguments = (self._endpoints[hub], name, "given", *map(str, targets))
-        program = self._stack.enter_context(Program(SENSOR, *arguments))
+    def sensor(self, name: str, *targets: int, hub: int = 0, code: str = SENSOR, order: str = "given") -> Program:
+        arguments = (self._endpoints[hub], name, order, *map(str, targets))
+        program = self._stack.enter_context(Program(code, *arguments))
         assert program.line() == "up"
         return program
 

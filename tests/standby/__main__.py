@@ -33,24 +33,42 @@ from fusion_service.cli import main as command
 from fusion_service.compiled.road import VARIABLE
 from tests.helpers.link import Between
 from tests.helpers.pair import Pair, Watch
-from tests.helpers.processes import Hub, eventually
+from tests.helpers.processes import Hub, Program, eventually
+from tests.service.test_intensity_service import SENSOR as INTENSITY
 
-SENSORS = {"r1": range(16), "r2": range(8, 24), "r3": range(4, 20)}
 TARGETS = range(24)
+
+
+def sensors(count: int) -> dict[str, range]:
+    """What each of three sees of so many targets: most by two or all."""
+    return {
+        "r1": range(count * 2 // 3),
+        "r2": range(count // 3, count),
+        "r3": range(count // 6, count * 5 // 6),
+    }
 
 
 class Mission:
     """A centre of two, and what came of doing something to the active one. rows: (seconds, gap, ids changed). lost:
     orders that were answered and did not stand; answered: seconds until they were."""
 
-    def __init__(self, hub: Hub, folder: Path, stack: ExitStack, frozen: float, centre: str = "") -> None:
-        self._endpoint, self._frozen = hub.endpoint, frozen
+    def __init__(self, hub: Hub, folder: Path, stack: ExitStack, args: argparse.Namespace) -> None:
+        self._endpoint, self._frozen = hub.endpoint, args.frozen
+        centre = args.settings.replace("; ", "\n") + "\n"
+        centre += 'kind = "intensity"\n' if args.intensity else ""
+        centre += 'clock = "message"\n' if args.what == ["pending"] else ""
         self.pair = Pair((hub.endpoint, hub.endpoint), folder, stack, centre)
         self.watches = (self.pair.watch,)
-        self._sensors = [self.pair.sensor(name, *targets) for name, targets in SENSORS.items()]
+        self.targets = range(args.targets)
+        start = self._intensity if args.intensity else self.pair.sensor
+        self._sensors = [start(name, *targets) for name, targets in sensors(args.targets).items()]
         self.lost: list[str] = []
         self.answered: list[float] = []
-        self.pair.started(*TARGETS)
+        self.pair.started(*self.targets)
+
+    def _intensity(self, name: str, *targets: int) -> Program:
+        """A sensor of an intensity: it sees all."""
+        return self.pair.sensor(name, *self.targets, code=INTENSITY, order=str(1000 * len(self.targets)))
 
     def _order(self, track: int, what: str) -> str:
         """Give a track a new name, and return that once it is answered, by a step or as one that waits for one."""
@@ -74,7 +92,7 @@ class Mission:
     def once(self, what: str) -> tuple[float, float, int]:
         watch = self.pair.watch
         eventually(watch.ready, 60)
-        eventually(lambda: watch.sees(*TARGETS), 20)
+        eventually(lambda: watch.sees(*self.targets), 20)
         time.sleep(random.uniform(0.0, 0.5))
         which = self.pair.active()
         program = self.pair.programs[which]
@@ -114,6 +132,7 @@ class Parted:
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self._hubs = stack.enter_context(Between())
+        self.targets = TARGETS
         self.pair = Pair(self._hubs.endpoints, folder, stack)
         self.watches = self.pair.watch, Watch(self._hubs.endpoints[1], stack)
         self.healed: list[float] = []
@@ -162,6 +181,9 @@ def main() -> None:
     parser.add_argument(
         "--frozen", type=float, default=3.0, metavar="S", help="how long a frozen one stays so (default 3)"
     )
+    parser.add_argument("--targets", type=int, default=24, help="how many (default 24)")
+    parser.add_argument("--intensity", action="store_true", help="of a centre and sensors of intensities")
+    parser.add_argument("--settings", default="", metavar="TEXT", help="""of the centre, as in 'trigger = "arrival"'""")
     args = parser.parse_args()
     os.environ["PYTHONFAULTHANDLER"] = "1"
     os.environ[VARIABLE] = "off"  # a process that is killed while it compiles leaves the next one to wait for that
@@ -173,8 +195,7 @@ def main() -> None:
         else:
             hub = Hub().start()
             stack.callback(hub.kill)
-            pending = 'clock = "message"\n' if args.what == ["pending"] else ""
-            mission = Mission(hub, Path(folder), stack, args.frozen, pending)
+            mission = Mission(hub, Path(folder), stack, args)
         for what in args.what:
             _told(mission, what, args.times)
         faults = [one for watch in mission.watches for one in watch.faults()]
@@ -202,7 +223,7 @@ def _told(mission: Mission | Parted, what: str, times: int) -> None:
     print(
         f"{what:9} {len(rows):4} times: picture of the other after {statistics.median(took):.2f} s (median), "
         f"{max(took):.2f} s (worst); gap in pictures {statistics.median(gaps):.2f} s, {max(gaps):.2f} s; "
-        f"ids changed: {sum(changed)} of {len(rows) * len(TARGETS)}",
+        f"ids changed: {sum(changed)} of {len(rows) * len(mission.targets)}",
         flush=True,
     )
     if isinstance(mission, Mission) and mission.answered:
