@@ -19,7 +19,7 @@ __all__ = ["Pair", "Seen", "Watch"]
 
 
 class Seen(NamedTuple):
-    """A picture, and when it came, s."""
+    """A picture, whole where it was a delta, and when it came, s."""
 
     at: float
     picture: GlobalTracks
@@ -40,6 +40,7 @@ class Watch:
         self.statuses: list[Status] = []
         self.logs: list[StepLog] = []
         self.alive: list[bool] = []
+        self._wholes = schemas.Wholes()
         self.bus = stack.enter_context(open_bus([endpoint], wait=10.0))
         self.bus.watch(schemas.global_key("*", "alive"), lambda key, alive: self.alive.append(alive))
         for what in ("tracks", "log", "status"):
@@ -48,7 +49,7 @@ class Watch:
     def _take(self, key: str, data: bytes) -> None:
         message = schemas.decode(data)
         if isinstance(message, GlobalTracks):
-            self.pictures.append(Seen(time.monotonic(), message))
+            self.pictures.append(Seen(time.monotonic(), self._wholes.of(message) or message))
         elif isinstance(message, Status):
             self.statuses.append(message)
         elif isinstance(message, StepLog):
