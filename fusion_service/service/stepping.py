@@ -4,8 +4,8 @@ What a step publishes waits for the disk only where a lost checkpoint would take
 confirmed, merged or split, one of an intensity begins, or something other than data came in (a source, an order, an
 era). Ids that end are noted in a few bytes (`State.note_ended`), since an id that has ended never returns, and so are
 tracks that begin, with the local tracks that feed them (`young`), which begin them again under the same ids. Else the
-checkpoint is saved after publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the ids that it has published, from
-data that are a second old at most. The centre is told for how long it was not there (`Skipped`).
+checkpoint is saved after publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the ids that
+it has published, from data that are a second old at most. The centre is told for how long it was not there (`Skipped`).
 """
 
 from __future__ import annotations

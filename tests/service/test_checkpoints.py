@@ -101,12 +101,14 @@ def test_young_tracks_of_an_intensity_are_on_disk_before_they_are_published(tmp_
     one = lasting()
     one.handle(info("r"), START)
     places = np.array([[0.0, 0.0, 10.0, 0.0], [5000.0, 0.0, 0.0, 10.0]])
+    shown: list[int] = []
     for second in (1, 2, 3):
         one.handle(intensity("r", second, places[: min(second, 2)]), START)
         made = one.step(START + second * SECOND)
         assert made is not None
         assert made.result.picture.status.tolist() == [TENTATIVE] * min(second, 2)
-    assert lasting().centre.view().ids.tolist() == made.result.picture.ids.tolist()
+        shown = made.result.picture.ids.tolist()
+    assert lasting().centre.view().ids.tolist() == shown
 
 
 def test_a_step_that_fails_brings_no_ended_track_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
