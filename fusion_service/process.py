@@ -23,7 +23,6 @@ from typing import NoReturn, TextIO, TypeVar, cast
 from fusion_service.escape import Escaped, escaped
 
 __all__ = [
-    "ABANDONED",
     "GRACE",
     "Parser",
     "argument",
@@ -41,9 +40,6 @@ T = TypeVar("T")
 
 GRACE = 4.0
 """Seconds after the first signal in which a process must have ended by itself."""
-ABANDONED = "compiler"
-"""The name of a thread that nobody waits for when all else has ended: it may be in one call for a minute."""
-
 _LOADING = threading.Event()
 
 
@@ -124,9 +120,10 @@ def loading() -> Iterator[None]:
         _LOADING.clear()
 
 
-def left_behind(code: int) -> int:
-    """`code`; but where an `ABANDONED` thread is at work, the process ends with it at once. For who has closed all."""
-    if any(one.name == ABANDONED for one in threading.enumerate()):
+def left_behind(code: int, thread: str) -> int:
+    """`code`; but where a thread of that name is at work, for which nobody waits, the process ends with it at once. For
+    who has closed all."""
+    if any(one.name == thread for one in threading.enumerate()):
         logging.shutdown()
         sys.stdout.flush()
         sys.stderr.flush()

@@ -18,12 +18,12 @@ from typing import Any
 from fusion_service.compiled import groups, kernels, three
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
-from fusion_service.process import ABANDONED, loading
 
-__all__ = ["CHOICES", "PLAIN", "VARIABLE", "begin", "is_kept", "road", "use"]
+__all__ = ["CHOICES", "PLAIN", "THREAD", "VARIABLE", "begin", "is_kept", "road", "use"]
 
 CHOICES = ("auto", "on", "off")
 VARIABLE = "FUSION_COMPILED"
+THREAD = "compiler"
 PLAIN = "plain"
 
 _LOCK = threading.Lock()
@@ -56,11 +56,9 @@ def use(choice: str = "auto", stop: threading.Event | None = None) -> str:
 
 def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> None:
     """`use(choice)`, and say by `told` which road is taken: at once where all is compiled already, or "on" is wanted;
-    else in a thread, while work goes on by the plain road. For a process that has nothing open yet: a signal meanwhile
-    ends it at once, and nobody waits for the thread at its end. `ValueError` where "on" cannot be had."""
+    else in a thread named `THREAD`, while work goes on by the plain road. `ValueError` where "on" cannot be had."""
     if _chosen(choice) in ("on", "off") or is_kept() or not _installed():
-        with loading():
-            told(use(choice, stop))
+        told(use(choice, stop))
         return
     told(f"{PLAIN}, until the compiler is done")
 
@@ -70,7 +68,7 @@ def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> No
         except Exception as error:
             told(f"{PLAIN}: {type(error).__name__}: {error}")
 
-    threading.Thread(target=run, name=ABANDONED).start()
+    threading.Thread(target=run, name=THREAD).start()
 
 
 def is_kept() -> bool:

@@ -14,10 +14,9 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
-from fusion_service.bus import Bus, Inbox, open_bus
+from fusion_service.bus import Bus, Inbox
 from fusion_service.bus.security import check_party, maybe_security
 from fusion_service.centre import (
     ClockSet,
@@ -32,6 +31,7 @@ from fusion_service.centre import (
 )
 from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
+from fusion_service.process import loading
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.complaints import Complaints
 from fusion_service.service.flow import Flow
@@ -87,7 +87,7 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
     """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `SecurityError`, `StateError`
     or `ConfigError`, which says in one line why it cannot start."""
     try:
-        begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
+        loading()(begin)(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
         raise ConfigError([f"[service] compiled: {error}"]) from None
     security = maybe_security(config.bus.security)
@@ -95,8 +95,7 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
         check_party(security, ("centre",), config.centre.name)
     log.info("%s", start_line(config))
     with open_state(config.service.state) as state:
-        join = partial(open_bus, config.bus.connect, stop=stop, security=security)
-        succeed(Process(config, state, stop, join, Service), standby)
+        succeed(Process(config, state, stop, security, Service), standby)
 
 
 class Service:

@@ -24,7 +24,7 @@ from fusion_service.config import CentreConfig
 from fusion_service.service.heard import HeardOrders
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, digest
 
-__all__ = ["Heritage", "Mark", "Shadow", "same_numbers", "same_tracks"]
+__all__ = ["PATIENCE", "Heritage", "Mark", "Shadow", "same_numbers", "same_tracks"]
 
 PATIENCE = 0.5
 """Seconds for which a step waits for the messages that it took, and for the log of the one before it."""

@@ -14,7 +14,8 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass
 from typing import Protocol
 
-from fusion_service.bus import Bus
+from fusion_service.bus import Bus, open_bus
+from fusion_service.bus.security import Security
 from fusion_service.config import ServiceConfig
 from fusion_service.service.standby import Standby
 from fusion_service.service.state import State
@@ -36,13 +37,17 @@ class Active(Protocol):
 
 @dataclass(frozen=True)
 class Process:
-    """What a process has for whatever its part is. join: opens a session on the bus; make: the service on one."""
+    """What a process has for whatever its part is. make: the service on a session on the bus."""
 
     config: ServiceConfig
     state: State
     stop: threading.Event
-    join: Callable[[], AbstractContextManager[Bus]]
+    security: Security | None
     make: Callable[[ServiceConfig, Bus, State, Tenure], Active]
+
+    def join(self) -> AbstractContextManager[Bus]:
+        """A session on the bus."""
+        return open_bus(self.config.bus.connect, stop=self.stop, security=self.security)
 
 
 def succeed(process: Process, standby: bool) -> None:
