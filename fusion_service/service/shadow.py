@@ -210,7 +210,7 @@ class Shadow:
         elif self._kept is not None:
             blob, mark, following = self._kept
         else:
-            return Heritage(None, np.zeros(0, dtype=np.uint64), [])
+            return Heritage(None, np.zeros(0, dtype=np.uint64), self.orders.since(0))
         gone = [ids for one, ids in self._ended.items() if one > mark]
         return Heritage(blob, np.concatenate([np.zeros(0, dtype=np.uint64), *gone]), self.orders.since(following))
 

@@ -242,9 +242,12 @@ class Tenure:
         return {name: one for name, one in self._followers.items() if one.ready and now - one.heard < FRESH}
 
     def _known(self) -> int | None:
-        """The greatest number of an order that all who could take over have; None where nobody could."""
+        """The greatest number of an order that all who stand by have; None where nobody does. Also who is not in step:
+        it would give again what its state does not know."""
+        now = seconds()
         with self._lock:
-            return min((one.known for name, one in self._ready().items() if name in self._there), default=None)
+            fresh = [one for name, one in self._followers.items() if name in self._there and now - one.heard < FRESH]
+        return min((one.known for one in fresh), default=None)
 
     def _others(self) -> dict[str, str]:
         """Who stands by, and why each could not take over."""

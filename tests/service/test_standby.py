@@ -119,7 +119,7 @@ def test_none_hands_over_to_nobody_and_all_to_one_of_other_settings(
     lonely: Program = pair.centre(1, standby=True)
     pair.sensor("r1", 0)
     pair.centre(0)
-    eventually(lambda: pair.watch.sees(0), 20)
+    eventually(lambda: pair.watch.sees(0), 40)  # three processes load
     eventually(pair.watch.ready, 20)
     lonely.kill()
     lonely.__exit__()

@@ -11,7 +11,7 @@ there is a fault.
 
 `--what partition` has two hubs, one process of the centre at each, and a third hub between them that is killed, and
 started again some seconds later: seconds from that to the first picture of the other process at its hub, and from the
-start of the hub until both sides have the pictures of one process and the other stands by again.
+start of the hub until both sides have the pictures of one process, and until the other stands by again.
 """
 
 from __future__ import annotations
@@ -127,14 +127,16 @@ class Mission:
 
 
 class Parted:
-    """A centre of two, each at a hub of its own, and what came of killing the hub between them. healed: seconds until
-    all was as before; alone: pictures that the one that was active published meanwhile."""
+    """A centre of two, each at a hub of its own, and what came of killing the hub between them. settled: seconds until
+    both sides have the pictures of one process; healed: until all is as before; alone: pictures that the one that was
+    active published meanwhile."""
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self._hubs = stack.enter_context(Between())
         self.targets = TARGETS
         self.pair = Pair(self._hubs.endpoints, folder, stack)
         self.watches = self.pair.watch, Watch(self._hubs.endpoints[1], stack)
+        self.settled: list[float] = []
         self.healed: list[float] = []
         self.alone: list[int] = []
         self.pair.sensor("r1", *range(16))
@@ -163,6 +165,7 @@ class Parted:
         eventually(
             lambda: all(one.pictures[-1].picture.epoch == epoch and one.sees(*TARGETS) for one in self.watches), 60
         )
+        self.settled.append(time.monotonic() - mended)
         eventually(lambda: all(one.ready() and one.term() == there.term() for one in self.watches), 60)
         self.healed.append(time.monotonic() - mended)
         changed = sum(there.pictures[-1].targets.get(target) != track for target, track in before.items())
@@ -231,12 +234,10 @@ def _told(mission: Mission | Parted, what: str, times: int) -> None:
         print(f"orders lost: {len(mission.lost)} of {len(answered)}", *mission.lost[:20], sep="\n  ")
         print(f"answered after {statistics.median(answered):.2f} s (median), {max(answered):.2f} s (worst)")
     if isinstance(mission, Parted):
-        healed = mission.healed
-        print(
-            f"whole again after {statistics.median(healed):.2f} s (median), {max(healed):.2f} s (worst); "
-            f"pictures of the other side meanwhile: {min(mission.alone)} at least, {sum(mission.alone)} in all",
-            flush=True,
-        )
+        for words, some in (("one process on both sides", mission.settled), ("whole again", mission.healed)):
+            longest = ", ".join(f"{one:.2f}" for one in sorted(some)[-5:])
+            print(f"{words} after {statistics.median(some):.2f} s (median), the longest {longest} s")
+        print(f"pictures of the other side meanwhile: {min(mission.alone)} at least, {sum(mission.alone)} in all")
 
 
 if __name__ == "__main__":
