@@ -113,6 +113,8 @@ class Mission:
         first = self.pair.taken_over(number, 30.0)
         last = [one for one in watch.pictures[number:] if one.picture.epoch != first.picture.epoch][-1]
         time.sleep(1.0)
+        if what == "pending":  # tracks coast meanwhile
+            eventually(lambda: watch.sees(*self.targets), 20)
         if name and name not in (watch.pictures[-1].picture.callsign or ()):
             self.lost.append(f"{name} does not stand")
         changed = sum(watch.pictures[-1].targets.get(target) != track for target, track in before.items())
