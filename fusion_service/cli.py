@@ -7,10 +7,12 @@ from collections.abc import Sequence
 
 from fusion_service import __version__
 from fusion_service.commands import COMMANDS
-from fusion_service.process import Parser, exit_code, set_up_logging, stop_on_signals
+from fusion_service.process import Parser, exit_code, left_behind, set_up_logging, stop_on_signals
 
 __all__ = ["main"]
 
+COMPILER = "compiler"
+"""The thread of `compiled.THREAD`, which is not loaded for that: it may be in one call for a minute."""
 CODES = "Exit codes: 0 done, or stopped by a signal; 2 bad usage or config; 1 failure, with one line that says why."
 
 
@@ -47,6 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         args = _parser().parse_args(argv)
         with stop_on_signals() as stop:
             set_up_logging(args.verbose)
-            return exit_code(f"fusion-service {args.command}", lambda: COMMANDS[args.command].run(args, stop))
+            code = exit_code(f"fusion-service {args.command}", lambda: COMMANDS[args.command].run(args, stop))
+        return left_behind(code, COMPILER) if stop.is_set() else code
     except KeyboardInterrupt:  # before the handlers were there
         return 0

@@ -28,6 +28,8 @@ __all__ = [
     "argument",
     "data_folder",
     "exit_code",
+    "left_behind",
+    "loading",
     "positive",
     "set_up_logging",
     "stop_on_signals",
@@ -38,6 +40,7 @@ T = TypeVar("T")
 
 GRACE = 4.0
 """Seconds after the first signal in which a process must have ended by itself."""
+_LOADING = threading.Event()
 
 
 class _JsonFormatter(logging.Formatter):
@@ -84,6 +87,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
             os._exit(1)
 
     def on_signal(number: int, frame: FrameType | None) -> None:
+        if _LOADING.is_set():
+            os._exit(0)
         for one in (signal.SIGINT, signal.SIGTERM, signal.SIGALRM):
             signal.signal(one, signal.SIG_DFL)
         signal.setitimer(signal.ITIMER_REAL, GRACE + 0.5)
@@ -102,6 +107,28 @@ def stop_on_signals() -> Iterator[threading.Event]:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """While it lasts nothing is open that must be closed: the first signal ends the process at once, with 0. For what
+    takes long to load, in the main thread."""
+    _LOADING.set()
+    try:
+        yield
+    finally:
+        _LOADING.clear()
+
+
+def left_behind(code: int, thread: str) -> int:
+    """`code`; but where a thread of that name is at work, for which nobody waits, the process ends with it at once. For
+    who has closed all."""
+    if any(one.name == thread for one in threading.enumerate()):
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+    return code
 
 
 def exit_code(program: str, call: Callable[[], object]) -> int:

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import time
+from contextlib import ExitStack
+from pathlib import Path
 
 import pytest
 
+from fusion_service.compiled.road import VARIABLE
 from tests.helpers.processes import Program
+from tests.helpers.scene import COMMAND
 
 SLOW_IMPORT = """
 import sys
@@ -53,6 +58,24 @@ def test_a_signal_while_modules_are_loaded_ends_it_quietly(number: signal.Signal
         program.signal(number)
         code, errors = program.end()  # closes its stdin: the import goes on
         assert (code, errors) == (0, "")
+
+
+def test_a_signal_while_the_compiler_loads_ends_it_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One that takes a minute to load: where its kernels are wanted at once, and where it works beside the rest."""
+    (tmp_path / "numba.py").write_text("import os, time\nos.write(1, b'loading\\n')\ntime.sleep(60)\n")
+    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}{os.pathsep}{os.environ.get('PYTHONPATH', '')}")
+    with ExitStack() as stack:
+        programs = []
+        for choice in ("on", "auto"):
+            monkeypatch.setenv(VARIABLE, choice)
+            programs.append(stack.enter_context(Program(COMMAND, "run", "--connect", "tcp/127.0.0.1:1")))
+        for program in programs:
+            assert program.line(20.0) == "loading"
+            program.signal(signal.SIGTERM)
+        for program in programs:
+            code, errors = program.end()
+            assert code == 0, errors
+            assert "not stopped" not in errors
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

@@ -104,6 +104,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     elif answer["done"]:
         more = ", when a step is made: none is at the moment" if answer.get("pending") else ""
         more += "" if answer.get("kept", True) else " (not on disk: the service keeps no state, or cannot write it)"
+        more += "" if answer.get("followed", True) else " (not heard yet by the process that stands by)"
         print(f"order {answer['number']}: {answer['outcome']}{more}")
     else:
         raise OrderError(f"order {answer['number']} is refused: {answer['outcome']}")

@@ -7,7 +7,7 @@ import dataclasses
 import threading
 
 from fusion_service.bus.endpoint import check_endpoint
-from fusion_service.process import argument
+from fusion_service.process import argument, loading
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
@@ -39,14 +39,14 @@ def add(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Run the service until `stop` is set. Raises `ConfigError`, `BusError`, `SecurityError`,
     `StateError`."""
-    from fusion_service.bus.hub import open_hub
-    from fusion_service.bus.security import hub_security
-    from fusion_service.config import ServiceConfig, load_config
+    with loading():
+        from fusion_service.bus.hub import open_hub
+        from fusion_service.bus.security import hub_security
+        from fusion_service.config import ServiceConfig, load_config
+        from fusion_service.service.daemon import run_service
 
-    if stop.is_set():  # what follows is slow to load
+    if stop.is_set():
         return
-    from fusion_service.service.daemon import run_service
-
     config = load_config(args.config) if args.config else ServiceConfig()
     if args.connect:
         config = dataclasses.replace(config, bus=dataclasses.replace(config.bus, connect=tuple(args.connect)))

@@ -10,6 +10,6 @@ says "auto".
 """
 
 from fusion_service.compiled.either import either
-from fusion_service.compiled.road import CHOICES, PLAIN, begin, is_kept, road, use
+from fusion_service.compiled.road import CHOICES, PLAIN, THREAD, begin, is_kept, road, use
 
-__all__ = ["CHOICES", "PLAIN", "begin", "either", "is_kept", "road", "use"]
+__all__ = ["CHOICES", "PLAIN", "THREAD", "begin", "either", "is_kept", "road", "use"]

@@ -19,10 +19,11 @@ from fusion_service.compiled import groups, kernels, three
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
 
-__all__ = ["CHOICES", "PLAIN", "VARIABLE", "begin", "is_kept", "road", "use"]
+__all__ = ["CHOICES", "PLAIN", "THREAD", "VARIABLE", "begin", "is_kept", "road", "use"]
 
 CHOICES = ("auto", "on", "off")
 VARIABLE = "FUSION_COMPILED"
+THREAD = "compiler"
 PLAIN = "plain"
 
 _LOCK = threading.Lock()
@@ -55,7 +56,7 @@ def use(choice: str = "auto", stop: threading.Event | None = None) -> str:
 
 def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> None:
     """`use(choice)`, and say by `told` which road is taken: at once where all is compiled already, or "on" is wanted;
-    else in a thread, while work goes on by the plain road. `ValueError` where "on" cannot be had."""
+    else in a thread named `THREAD`, while work goes on by the plain road. `ValueError` where "on" cannot be had."""
     if _chosen(choice) in ("on", "off") or is_kept() or not _installed():
         told(use(choice, stop))
         return
@@ -67,7 +68,7 @@ def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> No
         except Exception as error:
             told(f"{PLAIN}: {type(error).__name__}: {error}")
 
-    threading.Thread(target=run, name="compiler").start()
+    threading.Thread(target=run, name=THREAD).start()
 
 
 def is_kept() -> bool:

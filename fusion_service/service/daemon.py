@@ -14,10 +14,9 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 from typing import NamedTuple
 
-from fusion_service.bus import Bus, Inbox, open_bus
+from fusion_service.bus import Bus, Inbox
 from fusion_service.bus.security import check_party, maybe_security
 from fusion_service.centre import (
     ClockSet,
@@ -32,6 +31,7 @@ from fusion_service.centre import (
 )
 from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
+from fusion_service.process import loading
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.complaints import Complaints
 from fusion_service.service.flow import Flow
@@ -43,7 +43,7 @@ from fusion_service.service.promises import Reply
 from fusion_service.service.state import State, open_state
 from fusion_service.service.status import StatusMaker, start_line, status_line
 from fusion_service.service.stepping import LastingCentre
-from fusion_service.service.succession import succeed
+from fusion_service.service.succession import Process, succeed
 from fusion_service.service.tenure import Tenure
 from fusion_service.service.timing import StepTimes
 from fusion_service.service.tokens import Tokens
@@ -87,7 +87,7 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
     """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `SecurityError`, `StateError`
     or `ConfigError`, which says in one line why it cannot start."""
     try:
-        begin(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
+        loading()(begin)(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
         raise ConfigError([f"[service] compiled: {error}"]) from None
     security = maybe_security(config.bus.security)
@@ -95,8 +95,7 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
         check_party(security, ("centre",), config.centre.name)
     log.info("%s", start_line(config))
     with open_state(config.service.state) as state:
-        join = partial(open_bus, config.bus.connect, stop=stop, security=security)
-        succeed(config, state, stop, join, Service, standby)
+        succeed(Process(config, state, stop, security, Service), standby)
 
 
 class Service:
@@ -116,7 +115,7 @@ class Service:
         self._tokens = Tokens(self._inbox.wake)
         self._desk = OrderDesk(lambda order: self._inbox.put("", order), secured=config.bus.security is not None)
         self._lasting = LastingCentre(config.centre, state, self._desk, self._told, self._counts, self._tokens.forget)
-        self._desk.promises.may = self._tenure.may_publish
+        self._tenure.vouch(self._desk.promises)
         self._times = StepTimes(config.centre, authenticated=config.bus.security is not None)
         self._flow = Flow(config.limits)
         self._overload = Overload(self._times.patience)
@@ -214,6 +213,7 @@ class Service:
     def _on_sample(self, key: str, data: bytes) -> None:
         scope, name, _ = key.rsplit("/", 3)[-3:]
         source = centre_source(name) if scope == "global" else name
+        self._tenure.hears()
         if self._flow.takes(source, len(data)):
             self._inbox.put(source, Arrival(key, data, time.time_ns()), len(data))
 
@@ -222,9 +222,7 @@ class Service:
 
     def _on_order(self, payload: bytes | None, reply: Reply, operator: str = "") -> None:
         may = bool(operator) or self._config.bus.security is None
-        if may and (answer := self._tenure.ordered(payload, operator)) is not None:
-            reply(answer)
-        else:
+        if not (may and self._tenure.ordered(payload, operator, reply)):
             self._desk.answer(payload, reply, operator)
 
     def _on_picture(self, payload: bytes | None) -> bytes:
@@ -329,8 +327,8 @@ class Service:
         self._times.made(time.perf_counter() - begin)
         if made is None:
             return
-        for what, payload in made.messages.items():
-            self._put(what, payload)
+        for what in self._tenure.order:
+            self._put(what, made.messages[what])
         self._tenure.stepped(made.result.log.step, at, self._lasting.centre.epoch, self._lasting.generation)
         self._status.published(at, time.time_ns())
         notes = made.result.status.notes

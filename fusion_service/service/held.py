@@ -1,7 +1,7 @@
 """Orders on disk that no step has obeyed yet: a file beside the checkpoint, which they leave for it.
 
 One that is answered before a step, since none comes, is written here first; a service that begins again gives its
-centre those whose numbers the checkpoint does not know.
+centre those whose numbers the checkpoint does not know. So does one that takes over, with the other's (`inherit`).
 """
 
 from __future__ import annotations
@@ -30,10 +30,21 @@ class HeldOrders:
     def __init__(self, folder: Path | None) -> None:
         self._path = None if folder is None else folder / NAME
         self._newest = 0
+        self._inherited: list[Order] = []
+
+    def inherit(self, orders: Sequence[Order]) -> None:
+        """A service begins next that goes on where another one was, which had taken these."""
+        self._inherited = list(orders)
+        try:
+            if orders:
+                self.add(orders)
+        except OSError as error:
+            log.error("cannot keep what was ordered: %s", error)
 
     def read(self, following: int) -> list[Order]:
         """Those of number `following` and above, in order; what cannot be read, and all behind it, is left out."""
         found: dict[int, Order] = {}
+        inherited, self._inherited = self._inherited, []
         try:
             for event in msgpack.Unpacker(_Start(self._bytes()), max_buffer_size=MOST_BYTES):
                 order = order_of(event) if isinstance(event, dict) else None
@@ -41,6 +52,7 @@ class HeldOrders:
                     found[order.number] = order
         except (OSError, ValueError, TypeError, msgpack.exceptions.UnpackException, RecursionError) as error:
             log.warning("%s cannot be read to its end: %s", self._path, error or type(error).__name__)
+        found |= {order.number: order for order in inherited if order.number >= following}
         self._newest = max(found, default=0)
         return [order for _, order in sorted(found.items())]
 

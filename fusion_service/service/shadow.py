@@ -3,9 +3,10 @@
 A step log names what the step took; the messages came here too, so the same step is made of them. What comes of it is
 compared with the picture that the active centre published. Where a message is missing, a step failed or gave other
 tracks, or the settings differ, nothing more is made: `wanted` says why a new checkpoint is needed. Until it is there,
-the last one is what this process would go on from, without the tracks that have ended since, as a service does that was
-killed. Where the same tracks have other numbers, it goes on, and takes a new checkpoint when it may: a checkpoint does
-not tell what came before it, so that data that were late for steps before it change the active centre's alone.
+this process would go on from the last step that it made, or, where that came out wrong, from the last checkpoint,
+without the tracks that have ended since, as a service does that was killed, and with the orders given since. Where the
+same tracks have other numbers, it goes on, and takes a new checkpoint when it may: a checkpoint does not tell what came
+before it, so that data that were late for steps before it change the active centre's alone.
 """
 
 from __future__ import annotations
@@ -16,13 +17,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.centre import Centre, make_centre, source_of
+from fusion_service.centre import Centre, Order, make_centre, source_of
 from fusion_service.centre.inputs import Input, InputBuffer
 from fusion_service.centre.retracing import events_of, step_again
 from fusion_service.config import CentreConfig
+from fusion_service.service.heard import HeardOrders
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, digest
 
-__all__ = ["Mark", "Shadow", "same_numbers", "same_tracks"]
+__all__ = ["PATIENCE", "Heritage", "Mark", "Shadow", "same_numbers", "same_tracks"]
 
 PATIENCE = 0.5
 """Seconds for which a step waits for the messages that it took, and for the log of the one before it."""
@@ -38,10 +40,19 @@ Mark = tuple[int, int]
 
 
 class Kept(NamedTuple):
-    """A checkpoint of the active centre, and after which step it was made."""
+    """A checkpoint, after which step it was made, and the number of the first order that it does not know."""
 
     blob: bytes
     mark: Mark
+    following: int
+
+
+class Heritage(NamedTuple):
+    """What to go on from: a checkpoint, None where there is none, and since then tracks that have ended, and orders."""
+
+    checkpoint: bytes | None
+    ended: NDArray[np.uint64]
+    orders: list[Order]
 
 
 class Shadow:
@@ -66,7 +77,8 @@ class Shadow:
         self.wanted = "it has none yet"
         self.loaded = float("-inf")
         """When a checkpoint was taken, s."""
-        self._off = False
+        self.orders = HeardOrders()
+        self._off = self._astray = False
         self.off = 0
         """Steps whose numbers differed."""
         self.steps = self.fetched = 0
@@ -87,8 +99,9 @@ class Shadow:
         centre, fault = make_centre(self._config, blob, epoch=mark[0])
         if fault:
             return fault
-        self._centre, self._kept, self.mark, self.wanted = centre, Kept(blob, mark), mark, ""
-        self.fetched, self.loaded, self._off = self.fetched + 1, self._now(), False
+        self._centre, self._kept, self.mark, self.wanted = centre, Kept(blob, mark, centre.orders.next), mark, ""
+        self.fetched, self.loaded, self._off, self._astray = self.fetched + 1, self._now(), False, False
+        self.orders.settle(mark[0], centre.orders.next)
         self._made.clear()
         for _, (log, _) in sorted(self._logs.items()):
             if (log.epoch, log.step) <= mark:
@@ -113,6 +126,8 @@ class Shadow:
             return
         mark = message.epoch, message.step
         self.newest = max(self.newest, mark)
+        if isinstance(message, StepLog):
+            self.orders.tell(message.epoch, message.events)
         if mark <= self.mark:
             if isinstance(message, GlobalTracks):
                 self._check(mark, message)
@@ -125,6 +140,11 @@ class Shadow:
         for held in (self._logs, self._pictures, self._ended):
             while len(held) > MOST:
                 del held[min(held)]
+
+    @property
+    def waits(self) -> bool:
+        """Whether a step is to be made yet, for which something has not come."""
+        return not self.wanted and any(one > self.mark for one in self._logs)
 
     def advance(self) -> None:
         """Make the steps that can be made."""
@@ -153,10 +173,10 @@ class Shadow:
         try:
             result = step_again(self._centre, events_of(log), inputs, log.time)
         except Exception as error:  # whatever the active centre did, this one goes on
-            self.wanted = f"step {mark[1]} cannot be made here ({type(error).__name__}: {error})"
+            self._stray(f"step {mark[1]} cannot be made here ({type(error).__name__}: {error})")
             return
         if result.tracks.step != mark[1]:
-            self.wanted = f"step {mark[1]} came out as step {result.tracks.step}"
+            self._stray(f"step {mark[1]} came out as step {result.tracks.step}")
             return
         self.mark, self.steps = mark, self.steps + 1
         self._buffer.settle(log, self._config.lateness)
@@ -166,26 +186,33 @@ class Shadow:
             del self._made[min(self._made)]
         if (published := self._pictures.pop(mark, None)) is not None:
             self._check(mark, published)
+        if self.orders.full and not self._astray:
+            self._kept = Kept(self._centre.checkpoint(), mark, self._centre.orders.next)
+            self.orders.settle(mark[0], self._centre.orders.next)
+
+    def _stray(self, why: str) -> None:
+        """What was made here is not the active centre's state."""
+        self.wanted, self._astray = why, True
 
     def _check(self, mark: Mark, published: GlobalTracks) -> None:
         made = self._made.pop(mark, None)
         if made is None or self.wanted:
             return
         if not same_tracks(made, published):
-            self.wanted = f"step {mark[1]} gave other tracks than the active centre's"
+            self._stray(f"step {mark[1]} gave other tracks than the active centre's")
         elif not same_numbers(made, published):
             self._off, self.off = True, self.off + 1
 
-    def heritage(self) -> tuple[bytes | None, NDArray[np.uint64]]:
-        """What to go on from: a checkpoint, None where there is none, and the tracks that have ended since."""
-        if self._centre is not None and not self.wanted:
-            blob, mark = self._centre.checkpoint(), self.mark
+    def heritage(self) -> Heritage:
+        """See the class of it."""
+        if self._centre is not None and not self._astray:
+            blob, mark, following = self._centre.checkpoint(), self.mark, self._centre.orders.next
         elif self._kept is not None:
-            blob, mark = self._kept
+            blob, mark, following = self._kept
         else:
-            return None, np.zeros(0, dtype=np.uint64)
+            return Heritage(None, np.zeros(0, dtype=np.uint64), self.orders.since(0))
         gone = [ids for one, ids in self._ended.items() if one > mark]
-        return blob, np.concatenate([np.zeros(0, dtype=np.uint64), *gone])
+        return Heritage(blob, np.concatenate([np.zeros(0, dtype=np.uint64), *gone]), self.orders.since(following))
 
     def left(self, since: int) -> list[tuple[str, Input]]:
         """What came since then, ns, and was in no step yet, each with its source, in the order of arrival."""

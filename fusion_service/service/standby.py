@@ -17,7 +17,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import msgpack
@@ -25,11 +25,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.bus import Bus, BusError, Inbox
-from fusion_service.centre import is_picture_of
+from fusion_service.centre import Order, is_picture_of
 from fusion_service.config import ServiceConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.deafness import Deafness
 from fusion_service.service.notify import notify
-from fusion_service.service.shadow import Shadow
+from fusion_service.service.shadow import PATIENCE, Shadow
 from fusion_service.service.state import State
 from fusion_service.service.tenure import seconds, terms_held
 from fusion_service.service.terms import MOST_GENERATION, free_node, node_of
@@ -70,6 +71,7 @@ class Succession(NamedTuple):
     ended: NDArray[np.uint64]
     generation: int
     epoch: int
+    orders: Sequence[Order]
 
 
 class Sample(NamedTuple):
@@ -86,6 +88,13 @@ class Loaded(NamedTuple):
     step: int
 
 
+class Told(NamedTuple):
+    """Orders that wait for a step of the active centre, of the run `epoch`."""
+
+    epoch: int
+    events: list[dict[str, Any]]
+
+
 class Standby:
     """Stands by on `bus`. probe: a session that watches nothing. state: the process' own, where its node, and now and
     then what it holds, is kept."""
@@ -94,7 +103,8 @@ class Standby:
         self._config, self._bus, self._probe, self._state = config, bus, probe, state
         self._takeover = config.service.takeover
         self._shadow = Shadow(config.centre, seconds)
-        self._inbox: Inbox[Sample | Loaded] = Inbox(config.bus.queue)
+        self._inbox: Inbox[Sample | Loaded | Told] = Inbox(config.bus.queue)
+        self._deafness = Deafness(seconds)
         self._told = BoundedLog(1.0)
         self._name = f"{time.time_ns():x}"
         self._lock = threading.Lock()
@@ -172,6 +182,8 @@ class Standby:
         source = centre_source(name) if scope == "global" else name
         if scope == "global" and name == self._config.centre.name:
             self._sign, self._awake = seconds(), 0.0
+        else:
+            self._deafness.sample()
         self._inbox.put(source, Sample(key, data, time.time_ns()), len(data))
 
     def _on_term(self, key: str, alive: bool) -> None:
@@ -215,7 +227,8 @@ class Standby:
         behind = shadow.newest[1] - shadow.mark[1] if shadow.newest[0] == shadow.mark[0] else 1
         ready = shadow.ready and ((not shadow.wanted and behind <= 1) or seconds() - shadow.loaded < COPIED)
         said = {"name": self._name, "node": self._state.node, "step": shadow.mark[1], "ready": ready}
-        payload = msgpack.packb(request | said | {"takeover": self._takeover})
+        said |= {"takeover": self._takeover, "ordered": shadow.orders.known, "why": shadow.wanted[:200]}
+        payload = msgpack.packb(request | said)
         key = global_key(self._config.centre.name, "state", realm)
         patience = 0.75 * self._takeover
         try:
@@ -239,6 +252,9 @@ class Standby:
             if isinstance(generation, int) and isinstance(epoch, int):
                 self._generation = max(self._generation, min(generation, MOST_GENERATION))
                 self._epoch = max(self._epoch, min(epoch, MOST_EPOCH))
+        self._deafness.told(answer.get("heard"))
+        if isinstance(held := answer.get("orders"), list) and isinstance(epoch, int):
+            self._inbox.put("", Told(epoch, [one for one in held if isinstance(one, dict)]))
 
     def _fetch(self, stop: threading.Event, last: bool = False) -> None:
         """A checkpoint of the active process, part by part, into the inbox. last: the one that it has made by itself,
@@ -264,14 +280,22 @@ class Standby:
 
     # The loop
 
-    def _receive(self, item: Sample | Loaded) -> None:
-        if isinstance(item, Loaded):
+    def _receive(self, item: Sample | Loaded | Told) -> None:
+        known = self._shadow.orders.known
+        if isinstance(item, Told):
+            self._shadow.orders.tell(item.epoch, item.events)
+        elif isinstance(item, Loaded):
             fault = self._shadow.load(item.blob, (item.epoch, item.step))
             if fault:
                 self._told.warn("the active centre's checkpoint cannot be used: %s", fault)
             else:
                 log.info("in step with the active centre, from its step %d on", item.step)
-            return
+        else:
+            self._read(item)
+        if self._shadow.orders.known > known:
+            self._hurry.set()  # whoever gave the order waits for that
+
+    def _read(self, item: Sample) -> None:
         try:
             message = decode(item.data)
         except ValueError:
@@ -293,9 +317,8 @@ class Standby:
             log.warning("nobody is active as %s: waiting for one (`fusion-service run`)", self._config.centre.name)
         if shadow.ready and not shadow.wanted and now - self._saved > KEPT:
             self._saved = now
-            blob, _ = shadow.heritage()
             try:
-                self._state.save(blob or b"")
+                self._state.save(shadow.heritage().checkpoint or b"")
             except OSError as error:
                 self._told.error("cannot save the checkpoint: %s", error)
 
@@ -318,7 +341,7 @@ class Standby:
             patience = RANK * self._rank()
             if self._holding:
                 why = self._why_not_holding(max(self._holding), now, patience)
-            elif now - self._none_since < (GRACE if self._met else ALONE) + patience:
+            elif now - self._none_since < (GRACE if self._met else ALONE) + patience + PATIENCE * self._shadow.waits:
                 return ""
             else:
                 why = "its token is gone: it has ended, or the bus is split" if self._met else "nobody is active"
@@ -333,7 +356,10 @@ class Standby:
         if min(now - self._sign, self._awake / AWAKE) > self._takeover + patience:
             return f"no sign of it for {now - self._sign:.1f} s"
         hung = HUNG * max(1.0, self._config.centre.period, self._config.service.status_period)
-        return f"its loop stands still for {self._age:.0f} s" if self._age > hung else ""
+        if self._age > hung:
+            return f"its loop stands still for {self._age:.0f} s"
+        deaf = self._deafness.seconds()
+        return f"it has heard nothing for {deaf:.0f} s of what comes here" if deaf > hung else ""
 
     def _is_so(self, why: str) -> bool:
         """Whether the hub, asked now, does not say otherwise."""
@@ -362,9 +388,9 @@ class Standby:
         return sum(name < self._name for name in self._nodes)
 
     def _succession(self, why: str) -> Succession:
-        checkpoint, ended = self._shadow.heritage()
+        checkpoint, ended, orders = self._shadow.heritage()
         if self._shadow.wanted and checkpoint is not None:
-            log.warning("takes over from the newest checkpoint of the other: %s", self._shadow.wanted)
+            log.warning("takes over from step %d of the other: %s", self._shadow.mark[1], self._shadow.wanted)
         with self._lock:
             terms = [*self._holding, self._following, self._generation]
-        return Succession(why, checkpoint, ended, max(terms), max(self._epoch, self._shadow.newest[0]))
+        return Succession(why, checkpoint, ended, max(terms), max(self._epoch, self._shadow.newest[0]), orders)

@@ -18,14 +18,16 @@ import fcntl
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.centre import Order
 from fusion_service.errors import FusionError
 from fusion_service.service.files import FULL, Files, Notes, opened_folder
+from fusion_service.service.held import HeldOrders
 from fusion_service.service.terms import NODES, generation_after
 
 __all__ = ["State", "StateError", "open_state"]
@@ -58,6 +60,8 @@ class State:
         self._files = None if folder is None else Files(folder)
         self._ended = None if self._files is None else Notes(self._files, "ended", ROOM_ENDED)
         self._born = None if self._files is None else Notes(self._files, "born", ROOM_BORN)
+        self.held = HeldOrders(folder)
+        """Orders that were answered and are in no checkpoint."""
         self._synced = 0.0
         self._last = 0
         self._unwritten = ""
@@ -86,9 +90,18 @@ class State:
         if self._files is not None:
             self._files.replace("node", f"{node}\n".encode(), sync=True)
 
-    def inherit(self, checkpoint: bytes | None, ended: NDArray[np.uint64], generation: int, epoch: int) -> None:
+    def inherit(
+        self,
+        checkpoint: bytes | None,
+        ended: NDArray[np.uint64],
+        generation: int,
+        epoch: int,
+        orders: Sequence[Order] = (),
+    ) -> None:
         """A service begins next that goes on where another one was: with this checkpoint instead of the own, without
-        the tracks that have `ended` since, and above that one's generation and epoch."""
+        the tracks that have `ended` since, with the orders that it does not know, and above that one's generation and
+        epoch."""
+        self.held.inherit(orders)
         if checkpoint is not None:
             self._heritage, self._inherits = (checkpoint, ended), True
         self._last, self.epoch_above = max(self._last, generation), max(self.epoch_above, epoch)
@@ -107,6 +120,7 @@ class State:
         if self._folder is not None:
             last = max(last, self._recorded(above))
         self._last = generation_after(max(last, min(above, MOST_GENERATION - 1)), self.node, _by_clock())
+        self._inherits = False
         if self._files is not None:
             self._record(self._files, f"{self._last:>10}\n".encode())
         return self._last
@@ -202,8 +216,7 @@ class State:
 
     def born(self) -> bytes:
         """What was noted of tracks that have begun since the last checkpoint was made, one note after the other."""
-        inherits, self._inherits = self._inherits, False
-        return b"" if self._born is None or inherits else self._born.read()
+        return b"" if self._born is None or self._inherits else self._born.read()
 
     def note_born(self, note: bytes) -> None:
         """Tracks have begun, which will be published: after kill -9 the note is in `born`. It must end with a byte that

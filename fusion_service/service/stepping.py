@@ -1,11 +1,11 @@
 """A centre that goes on whatever happens: it is made from its checkpoint, and made again from it should a step fail.
 
 What a step publishes waits for the disk only where a lost checkpoint would take back what was said: a track is
-confirmed, merged or split, or something other than data came in (a source, an order, an era). Ids that end are noted in
-a few bytes (`State.note_ended`), since an id that has ended never returns, and so are tracks that begin, with the local
-tracks that feed them (`young`), which begin them again under the same ids. Else the checkpoint is saved after
-publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the ids that it has published, from
-data that are a second old at most. The centre is told for how long it was not there (`Skipped`).
+confirmed, merged or split, one of an intensity begins, or something other than data came in (a source, an order, an
+era). Ids that end are noted in a few bytes (`State.note_ended`), since an id that has ended never returns, and so are
+tracks that begin, with the local tracks that feed them (`young`), which begin them again under the same ids. Else the
+checkpoint is saved after publishing, every `SAVED_EVERY` at most. So a service that is killed goes on with the ids that
+it has published, from data that are a second old at most. The centre is told for how long it was not there (`Skipped`).
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from fusion_service.centre import (
 )
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
-from fusion_service.service.held import HeldOrders, synced
+from fusion_service.service.held import synced
 from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
@@ -99,9 +99,10 @@ class LastingCentre:
         self._faulty: dict[tuple[str, str, int, int], None] = {}
         self.centre = self._make_centre()
         desk.follow(self.centre)
-        self._held = HeldOrders(state.folder)
+        self._held = state.held
         for order in self._held.read(self.centre.orders.next):
             log.info("order %d of before is given again: %s", order.number, order.what)
+            desk.promises.wait_for(order)
             self.handle(order, time.time_ns())
 
     def _usable(self, checkpoint: bytes | None) -> bytes | None:
@@ -167,7 +168,7 @@ class LastingCentre:
         return made
 
     def _settle(self, journal: StepLog, saved: bool) -> None:
-        """Answer the orders of a step, whose checkpoint was `saved`."""
+        """Let the orders of a step be answered, whose checkpoint was `saved`, once it is published."""
         orders = [event for event in journal.events if event.get("kind") == "order"]
         if not orders:
             return
@@ -182,7 +183,7 @@ class LastingCentre:
         self._desk.promises.settle(orders, kept)
 
     def _hold_orders(self) -> None:
-        """Write down the orders that have waited for a step for too long, and answer them."""
+        """Write down the orders that have waited for a step for too long, and answer what may be answered."""
         overdue = self._desk.promises.overdue()
         if overdue:
             try:
@@ -191,6 +192,7 @@ class LastingCentre:
                 kept = False
                 self._told.error("cannot keep what was ordered: %s", error)
             self._desk.promises.hold(overdue, kept)
+        self._desk.promises.release()
 
     @property
     def generation(self) -> int:
@@ -217,7 +219,7 @@ class LastingCentre:
         """Make a step, and all that it leaves behind, or raise with nothing left behind."""
         self._tell_sleep(at)
         result = self.centre.step(at)
-        checkpoint = self.centre.checkpoint() if _settles(result) else None
+        checkpoint = self.centre.checkpoint() if _settles(result, self._config.kind) else None
         sent = time.time_ns()
         tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
         payloads = {"tracks": encode(tracks, sound=True), "log": encode(journal, sound=True)}
@@ -324,11 +326,14 @@ class LastingCentre:
             self.centre.handle(order, time.time_ns())
 
 
-def _settles(result: StepResult) -> bool:
-    """Whether a step says something, or obeys something, that a centre made anew must know."""
+def _settles(result: StepResult, kind: str) -> bool:
+    """Whether a step says something, or obeys something, that a centre made anew must know. Tracks of an intensity have
+    no local tracks by which a note could tell them."""
     picture, log = result.tracks, result.log
     merged = any(heir is not None for _, _, heir in picture.ended)
-    return bool(merged or picture.split_from or log.events or (log.decisions.kind == messages.CONFIRMED_NOW).any())
+    known = messages.BORN if kind == "intensity" else messages.CONFIRMED_NOW
+    began = np.isin(log.decisions.kind, (known, messages.CONFIRMED_NOW)).any()
+    return bool(merged or picture.split_from or log.events or began)
 
 
 def _name_of(message: Message) -> tuple[str, str, int, int]:

@@ -11,16 +11,18 @@ import logging
 import threading
 from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
 from typing import Protocol
 
-from fusion_service.bus import Bus
+from fusion_service.bus import Bus, open_bus
+from fusion_service.bus.security import Security
 from fusion_service.config import ServiceConfig
 from fusion_service.service.standby import Standby
 from fusion_service.service.state import State
 from fusion_service.service.tenure import Tenure, terms_held
 from schemas import token_key
 
-__all__ = ["Active", "succeed"]
+__all__ = ["Active", "Process", "succeed"]
 
 log = logging.getLogger(__name__)
 
@@ -33,31 +35,31 @@ class Active(Protocol):
     def feed(self, source: str, key: str, data: bytes, received: int) -> None: ...
 
 
-def succeed(
-    config: ServiceConfig,
-    state: State,
-    stop: threading.Event,
-    join: Callable[[], AbstractContextManager[Bus]],
-    make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
-    standby: bool,
-) -> None:
-    """Run as what the process is, one part after the other, until `stop` is set. join: opens a session on the bus;
-    make: the service on one. Raises what they do."""
-    with join() as probe:
-        while not stop.is_set():
-            standby = _part(config, state, stop, join, make, standby, probe)
+@dataclass(frozen=True)
+class Process:
+    """What a process has for whatever its part is. make: the service on a session on the bus."""
+
+    config: ServiceConfig
+    state: State
+    stop: threading.Event
+    security: Security | None
+    make: Callable[[ServiceConfig, Bus, State, Tenure], Active]
+
+    def join(self) -> AbstractContextManager[Bus]:
+        """A session on the bus."""
+        return open_bus(self.config.bus.connect, stop=self.stop, security=self.security)
 
 
-def _part(
-    config: ServiceConfig,
-    state: State,
-    stop: threading.Event,
-    join: Callable[[], AbstractContextManager[Bus]],
-    make: Callable[[ServiceConfig, Bus, State, Tenure], Active],
-    standby: bool,
-    probe: Bus,
-) -> bool:
+def succeed(process: Process, standby: bool) -> None:
+    """Run as what the process is, one part after the other, until `stop` is set. Raises what `join` and `make` do."""
+    with process.join() as probe:
+        while not process.stop.is_set():
+            standby = _part(process, standby, probe)
+
+
+def _part(process: Process, standby: bool, probe: Bus) -> bool:
     """Be one part until it ends; whether the next is to stand by."""
+    config, state, stop = process.config, process.state, process.stop
     holds = token_key(config.centre.name, "holds", "*", config.bus.realm)
     if not standby and (terms := terms_held(probe.present(holds)[0])):
         log.warning("a centre named %s is active, term %d: standing by for it", config.centre.name, terms[-1])
@@ -67,15 +69,15 @@ def _part(
         why = ""
         if standby:
             heard = stack.enter_context(ExitStack())
-            waiting = Standby(config, heard.enter_context(join()), probe, state)
+            waiting = Standby(config, heard.enter_context(process.join()), probe, state)
             heard.callback(waiting.join)
             heritage = waiting.wait(stop)
             if heritage is None:
                 return True
-            state.inherit(heritage.checkpoint, heritage.ended, heritage.generation, heritage.epoch)
+            state.inherit(*heritage[1:])
             why = f"took over: {heritage.why}"
-        bus = stack.enter_context(join())
-        service = make(config, bus, state, Tenure(config, bus, probe, why))
+        bus = stack.enter_context(process.join())
+        service = process.make(config, bus, state, Tenure(config, bus, probe, why))
         service.run(stop, _hand_on(waiting, service, heard, stack) if waiting is not None else None)
     return True
 

@@ -7,9 +7,12 @@ hub has told them, its own among them, and within that time. Clocks that go on w
 asked on a session that watches no tokens: one that does would answer from what it heard before it was frozen.
 
 Those who stand by ask `.../state`: for a sign of life, with which they say how far they have come; or for a checkpoint,
-a part at a time, which is made between two steps. An operator may order to hand over: then the last step is published,
-a checkpoint held ready for who cannot follow, `yields/{term}.{step}` announced, and no step made any more; should
-nobody have taken over in `HANDOVER` seconds, it goes on.
+a part at a time, which is made between two steps. What they say tells which orders they have, so that an order is
+answered when it outlives this process, and they are told of those that wait for a step. Where somebody stands by a
+step's log goes out before its picture: who sees a track in the picture sees it again after a take-over. An operator may
+order to hand over (`handover`): then the last step is published, a checkpoint held ready for who cannot follow,
+`yields/{term}.{step}` announced, and no step made any more; should nobody have taken over in `HANDOVER` seconds, it
+goes on.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ import msgpack
 
 from fusion_service.bus import Bus
 from fusion_service.config import ServiceConfig
+from fusion_service.service.handover import Handover
+from fusion_service.service.promises import Promises, Reply
 from fusion_service.service.terms import MOST_GENERATION
 from schemas import global_key, token_key
 
@@ -78,12 +83,14 @@ class Centre(Protocol):
 
 @dataclass(slots=True)
 class Follower:
-    """One that stands by: its node, the step it stands at, whether it could take over, its patience, s, and when it was
-    heard."""
+    """One that stands by: its node, the step it stands at, whether it could take over, and why not, the greatest number
+    of an order that it has, its patience, s, and when it was heard."""
 
     node: int
     step: int
     ready: bool
+    why: str
+    known: int
     takeover: float
     heard: float
 
@@ -103,7 +110,10 @@ class Tenure:
         self._held: dict[str, Held] = {}
         self._newer = 0
         self._lower: set[int] = set()
-        self._doubt = self._accompanied = self._handing = False
+        self._doubt = self._accompanied = False
+        self._handover = Handover(seconds)
+        self._promises = Promises()
+        self._heard = seconds()
         self._passed = self._asked = self._round = seconds()
         self._step = self._time = -1
         self._epoch = self._generation = 0
@@ -124,8 +134,22 @@ class Tenure:
         self._bus.watch(self._key("holds", "*"), self._on_term)
         self._bus.watch(self._key("standby", "*"), self._on_follower)
         self._bus.answer(global_key(self._name, "state", self._realm), self._answer)
-        self._passed = seconds()
+        self._passed = self._heard = seconds()
         log.info("active as %s, term %d", self._name, term)
+
+    def vouch(self, promises: Promises) -> None:
+        """Let the answers to orders wait for those who stand by."""
+        promises.may, promises.followed = self.may_publish, self._known
+        self._promises = promises
+
+    def hears(self) -> None:
+        """Something came from a source. Returns at once."""
+        self._heard = seconds()
+
+    @property
+    def order(self) -> tuple[str, ...]:
+        """In which order the messages of a step are published."""
+        return ("log", "tracks") if self._there else ("tracks", "log")
 
     def _key(self, what: str, name: str) -> str:
         return token_key(self._name, what, name, self._realm)
@@ -165,6 +189,7 @@ class Tenure:
         what, name = asked.get("what"), str(asked.get("name", ""))[:64]
         answer: dict[str, Any] = {"term": self.term, "epoch": self._epoch, "step": self._step, "time": self._time}
         answer |= {"generation": self._generation, "age": max(0.0, seconds() - self._round)}
+        answer |= {"heard": seconds() - self._heard} | ({"orders": held} if (held := self._promises.held()) else {})
         if what in ("sign", "state"):
             self._note(name, asked)
             with self._lock:
@@ -173,25 +198,25 @@ class Tenure:
                 answer |= self._part(name, asked.get("part"))
         return cast(bytes, msgpack.packb(answer))
 
-    def ordered(self, payload: bytes | None, operator: str) -> bytes | None:
-        """The answer to an order to hand over, None for any other. operator: on whose key it came."""
-        if not payload or len(payload) > MOST_BYTES or b"handover" not in payload:
-            return None
-        try:
-            raw = msgpack.unpackb(payload)
-        except Exception:  # whoever reads it next says what is wrong
-            return None
-        if not isinstance(raw, dict) or raw.get("what") != "handover":
-            return None
-        return cast(bytes, msgpack.packb(self._hand_over(operator or str(raw.get("who", ""))[:64])))
+    def ordered(self, payload: bytes | None, operator: str, reply: Reply) -> bool:
+        """Whether this was an order to hand over, which is answered later. operator: on whose key it came."""
+        taken = self._handover.take(payload, operator, reply)
+        if taken:
+            self._wake()
+        return taken
 
     def _note(self, name: str, asked: dict[str, Any]) -> None:
         node, step, takeover = asked.get("node"), asked.get("step"), asked.get("takeover")
         if not (type(node) is int and type(step) is int and isinstance(takeover, float) and takeover > 0):
             return
+        known, why = asked.get("ordered"), str(asked.get("why", ""))[:200]
+        ready, known = asked.get("ready") is True, known if type(known) is int else 0
         with self._lock:
-            if name in self._followers or len(self._followers) < MOST:
-                self._followers[name] = Follower(node, step, asked.get("ready") is True, takeover, seconds())
+            before = self._followers.get(name)
+            if before is not None or len(self._followers) < MOST:
+                self._followers[name] = Follower(node, step, ready, why, known, takeover, seconds())
+        if before is not None and (known, ready) != (before.known, before.ready):
+            self._wake()
 
     def _part(self, name: str, part: object) -> dict[str, Any]:
         """A part of the checkpoint that was made for `name`; without one, a new one is to be made."""
@@ -212,19 +237,24 @@ class Tenure:
         said = {"of": [held.epoch, held.step], "parts": parts, "part": part}
         return said | {"data": held.blob[part * PART : (part + 1) * PART]}
 
-    def _hand_over(self, who: str) -> dict[str, Any]:
-        with self._lock:
-            ready = [name for name, one in self._ready().items() if name in self._there]
-            if not ready:
-                return {"done": False, "outcome": "nobody stands by with the newest state"}
-            self._handing = True
-        log.info("%s orders to hand over to %s", who or "somebody", ready[0])
-        self._wake()
-        return {"done": True, "outcome": f"{ready[0]} goes on after the step that is under way"}
-
     def _ready(self) -> dict[str, Follower]:
         now = seconds()
         return {name: one for name, one in self._followers.items() if one.ready and now - one.heard < FRESH}
+
+    def _known(self) -> int | None:
+        """The greatest number of an order that all who stand by have; None where nobody does. Also who is not in step:
+        it would give again what its state does not know."""
+        now = seconds()
+        with self._lock:
+            fresh = [one for name, one in self._followers.items() if name in self._there and now - one.heard < FRESH]
+        return min((one.known for one in fresh), default=None)
+
+    def _others(self) -> dict[str, str]:
+        """Who stands by, and why each could not take over."""
+        with self._lock:
+            ready, said = self._ready(), {name: one.why for name, one in self._followers.items()}
+            there = sorted(self._there)
+        return {name: "" if name in ready else said.get(name) or "is not in step yet" for name in there}
 
     # In the loop
 
@@ -235,7 +265,7 @@ class Tenure:
     def goes_on(self, centre: Centre, stop: threading.Event) -> bool:
         """Come by once a round: hand out what was asked for. Whether the process is still the active one."""
         self._round = seconds()
-        handing = self._handing and self.may_publish()
+        handing = not stop.is_set() and self._handover.due(self._others()) and self.may_publish()
         if (self._wanted or handing) and self._step >= 0:
             with self._lock:
                 names, self._wanted = [*self._wanted, *(self._followers if handing else ())], {}
@@ -244,7 +274,10 @@ class Tenure:
                 self._held = dict(list(self._held.items())[-MOST:]) | dict.fromkeys(names, held)
         if handing:
             self._yield(stop)
-        return not self._gone()
+        gone = self._gone()
+        if gone or stop.is_set():
+            self._handover.done(self._newer, "the service stops")
+        return not gone
 
     def may_publish(self) -> bool:
         """Look, before anything is published, whether the name is still this process' own. On any thread."""
@@ -277,9 +310,10 @@ class Tenure:
         while not self._newer and not stop.is_set() and seconds() < deadline:
             time.sleep(0.005)
         token.close()
-        self._handing, self.handed = False, bool(self._newer)
+        self.handed = bool(self._newer)
         if not self._newer and not stop.is_set():
             self._say("nobody took over: this process goes on")
+        self._handover.done(self._newer, f"nobody took over within {HANDOVER:g} s: this process goes on")
 
     @property
     def farewell(self) -> str:

@@ -11,7 +11,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fusion_service.centre import MessageClock, WallClock
-from fusion_service.centre.votes import is_silent
 from fusion_service.config import CentreConfig
 from tests.centre.worlds import SECOND, START, tracks
 
@@ -186,6 +185,38 @@ def test_many_names_and_messages_cost_little() -> None:
     assert drain(one) == [0.0, 1.0]
 
 
+class Paces:
+    """Who is silent, as operating.md says: a source that has not gone on for three times its usual pace, by the time of
+    reception. Without such a time that goes on with the newest message, by a period at most from one to the next. The
+    pace is the longest of its usual gaps, of which it forgets a tenth with each message that comes sooner; of who was
+    heard once, or has only its token, half of `lateness`. Who falls back by more than `lateness` is silent too."""
+
+    def __init__(self, names: str, period: float, lateness: float) -> None:
+        self.period, self.lateness = period, lateness
+        self.now, self.newest_of_all = 0.0, -1.0
+        self.newest: dict[str, float] = {}
+        self.heard = dict.fromkeys(names, 0.0)
+        self.pace = dict.fromkeys(names, lateness / 2)
+        self.back: set[str] = set()
+
+    def says(self, name: str, time: float) -> None:
+        if self.newest_of_all >= 0:
+            self.now += min(max(time - self.newest_of_all, 0.0), self.period)
+        self.newest_of_all = max(self.newest_of_all, time)
+        before = self.newest.get(name)
+        if before is not None and time < before - self.lateness:
+            self.back.add(name)
+        if before is None or time > before:
+            if before is not None:
+                self.pace[name] = max(self.now - self.heard[name], 0.9 * self.pace[name])
+            self.heard[name] = self.now
+            self.back.discard(name)
+        self.newest[name] = max(time, self.newest.get(name, 0.0))
+
+    def silent(self, name: str) -> bool:
+        return name in self.back or self.now - self.heard[name] > 3.0 * self.pace[name] - 1e-6
+
+
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.sampled_from("abc"), st.integers(0, 40)), min_size=1, max_size=40))
 def test_steps_are_on_the_grid_grow_and_never_pass_the_front_nor_stay_behind_all(
@@ -195,21 +226,16 @@ def test_steps_are_on_the_grid_grow_and_never_pass_the_front_nor_stay_behind_all
     for name in "abc":
         one.presence(name, True)
     steps: list[float] = []
-    newest: dict[str, float] = {}
-    back: set[str] = set()
+    paces = Paces("abc", 1.0, 3.0)
+    newest = paces.newest
     for name, halves in messages:
         see(one, name, halves / 2)
-        if halves / 2 < newest.get(name, 0.0) - 3.0:
-            back.add(name)
-        elif halves / 2 > newest.get(name, 0.0):
-            back.discard(name)
-        newest[name] = max(newest.get(name, 0.0), halves / 2)
+        paces.says(name, halves / 2)
         new = drain(one)
         front = max(newest.values())
         for time in new:
-            # who fell back, is silent, or will be too late, is not waited for
-            awake = [other for other in "abc" if not is_silent(one._sources[other], one._now)]
-            said = [newest.get(other, -1) for other in awake if other not in back]
+            # who is silent, or will be too late, is not waited for
+            said = [newest.get(other, -1) for other in "abc" if not paces.silent(other)]
             assert all(one >= time or 0 <= one < time - 3.0 - 1.0 for one in said) or front > time + 3.0
         steps += new
         assert steps == sorted(set(steps))

@@ -63,6 +63,7 @@ def _mission(rng: random.Random, most: int, report: Report, counts: Counter[str]
         result = centre.step(now)
         look(result)
         desk.promises.settle((event for event in result.log.events if event.get("kind") == "order"), kept=True)
+        desk.promises.release()
         ids = result.picture.ids.tolist()
         if second % 8 == 0:
             centre, fault = make_centre(centre.config, centre.checkpoint(), generation=second)

@@ -1,4 +1,4 @@
-"""Two hubs with a link between them that can be cut: what a bus that splits looks like."""
+"""Two hubs with a link, or a third hub, between them that can be cut: what a bus that splits looks like."""
 
 from __future__ import annotations
 
@@ -92,5 +92,35 @@ class Hubs:
 
     def __exit__(self, *_: object) -> None:
         self.link.close()
+        for one in self._programs:
+            one.__exit__()
+
+
+class Between:
+    """Two hubs that know each other by a third one alone, which is killed and started again."""
+
+    def __init__(self) -> None:
+        self.endpoints = free_endpoint(), free_endpoint()
+        self._own = free_endpoint()
+        self._third: Program | None = None
+
+    def __enter__(self) -> Self:
+        self._programs = [Program(HUB, one) for one in self.endpoints]
+        self.mend()
+        return self
+
+    def cut(self) -> None:
+        """Kill the third one."""
+        if self._third is not None:
+            self._third.__exit__()
+            self._third = None
+
+    def mend(self) -> None:
+        """Start it again."""
+        if self._third is None:
+            self._third = Program(HUB, self._own, *self.endpoints)
+
+    def __exit__(self, *_: object) -> None:
+        self.cut()
         for one in self._programs:
             one.__exit__()

@@ -19,7 +19,7 @@ __all__ = ["Pair", "Seen", "Watch"]
 
 
 class Seen(NamedTuple):
-    """A picture, and when it came, s."""
+    """A picture, whole where it was a delta, and when it came, s."""
 
     at: float
     picture: GlobalTracks
@@ -40,6 +40,7 @@ class Watch:
         self.statuses: list[Status] = []
         self.logs: list[StepLog] = []
         self.alive: list[bool] = []
+        self._wholes = schemas.Wholes()
         self.bus = stack.enter_context(open_bus([endpoint], wait=10.0))
         self.bus.watch(schemas.global_key("*", "alive"), lambda key, alive: self.alive.append(alive))
         for what in ("tracks", "log", "status"):
@@ -48,7 +49,7 @@ class Watch:
     def _take(self, key: str, data: bytes) -> None:
         message = schemas.decode(data)
         if isinstance(message, GlobalTracks):
-            self.pictures.append(Seen(time.monotonic(), message))
+            self.pictures.append(Seen(time.monotonic(), self._wholes.of(message) or message))
         elif isinstance(message, Status):
             self.statuses.append(message)
         elif isinstance(message, StepLog):
@@ -61,9 +62,27 @@ class Watch:
     def sees(self, *targets: int) -> bool:
         return bool(self.pictures) and sorted(self.pictures[-1].targets) == sorted(targets)
 
+    def taken_over(self, since: int, timeout: float = 10.0) -> Seen:
+        """The first picture of another run than that of number `since` of the pictures."""
+        epoch = self.pictures[since].picture.epoch
+        found: list[Seen] = []
+
+        def there() -> bool:
+            found.extend(one for one in self.pictures[since:] if one.picture.epoch != epoch)
+            return bool(found)
+
+        eventually(there, timeout)
+        return found[0]
+
     def ready(self) -> bool:
         """Whether the active one says that another could take over."""
         return self.status is not None and bool(self.status.standby and self.status.standby["ready"])
+
+    def term(self) -> int:
+        """Of whoever is active."""
+        assert self.status is not None
+        assert self.status.term is not None
+        return self.status.term
 
     def names(self) -> dict[int, set[int]]:
         """Every global id that was ever confirmed -> the targets it was shown at."""
@@ -103,9 +122,9 @@ class Pair:
         self.programs: list[Program | None] = [None, None]
         self.watch = Watch(endpoints[0], stack)
 
-    def sensor(self, name: str, *targets: int, hub: int = 0) -> Program:
-        arguments = (self._endpoints[hub], name, "given", *map(str, targets))
-        program = self._stack.enter_context(Program(SENSOR, *arguments))
+    def sensor(self, name: str, *targets: int, hub: int = 0, code: str = SENSOR, order: str = "given") -> Program:
+        arguments = (self._endpoints[hub], name, order, *map(str, targets))
+        program = self._stack.enter_context(Program(code, *arguments))
         assert program.line() == "up"
         return program
 
@@ -130,18 +149,8 @@ class Pair:
 
     def active(self) -> int:
         """Which of the two is active, by the parity of its term's node: they are 0 and 1."""
-        assert self.watch.status is not None
-        assert self.watch.status.term is not None
-        return self.watch.status.term % 4
+        return self.watch.term() % 4
 
     def taken_over(self, since: int, timeout: float = 10.0) -> Seen:
-        """The first picture of another run than that of number `since` of the pictures."""
-        epoch = self.watch.pictures[since].picture.epoch
-        found: list[Seen] = []
-
-        def there() -> bool:
-            found.extend(one for one in self.watch.pictures[since:] if one.picture.epoch != epoch)
-            return bool(found)
-
-        eventually(there, timeout)
-        return found[0]
+        """The first picture of another run than that of number `since` of the pictures, at the first hub."""
+        return self.watch.taken_over(since, timeout)

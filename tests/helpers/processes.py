@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import select
 import signal
@@ -19,6 +20,8 @@ stop = threading.Event()
 threading.Thread(target=lambda: (sys.stdin.read(), stop.set()), daemon=True).start()
 run_hub([sys.argv[1]], stop)
 """
+ROOM = 2**20
+"""Bytes that a program may write to stderr before somebody must read it."""
 
 
 def free_endpoint() -> str:
@@ -42,6 +45,8 @@ class Program:
         command = [sys.executable, "-W", "error", "-c", code, *arguments]
         pipe = subprocess.PIPE
         self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
+        assert self._process.stderr is not None
+        fcntl.fcntl(self._process.stderr, fcntl.F_SETPIPE_SZ, ROOM)
         self._lines = b""
 
     def __enter__(self) -> Self:

@@ -247,6 +247,19 @@ def test_cu_holds_if_one_source_is_right() -> None:
     assert np.linalg.eigvalsh(average.covariance - P[1] - np.outer(d, d)).min() < -1.0
 
 
+def test_the_one_that_knows_nothing_may_be_the_only_one_that_is_right() -> None:
+    """A liar of sigma 10 m, 1 km off, and an honest one of 10,000 km, 1e-12 of its information: with both the error
+    is within the union, as promised; without the one that tells nothing the promise is kept by nobody."""
+    truth, x = np.array([1000.0, 0.0]), np.zeros((2, 2))
+    P = np.stack([100.0 * np.eye(2), 1e14 * np.eye(2)])
+    assert (truth - x[1]) @ np.linalg.solve(P[1], truth - x[1]) < 1.0
+    union = fuse("cu", x, P)
+    d = truth - union.mean
+    assert d @ np.linalg.solve(union.covariance, d) < 1.0
+    d = truth - x[0]
+    assert d @ np.linalg.solve(P[0], d) > 1e3
+
+
 def test_lemma_2_needs_more_than_conservative_sources() -> None:
     """Variances 1 and 100, fully correlated, equal weights: error 30.25, but min reports 21.25 on average."""
     e = np.random.default_rng(SEED).normal(size=20_000)

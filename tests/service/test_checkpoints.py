@@ -16,6 +16,8 @@ from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State
 from fusion_service.service.stepping import LastingCentre
+from schemas.messages import TENTATIVE
+from tests.centre.test_intensity import intensity
 from tests.centre.worlds import SECOND, START, info, tracks
 from tests.helpers.processes import Hub, eventually
 from tests.helpers.scene import Scene, opened
@@ -86,6 +88,27 @@ def test_what_is_confirmed_and_orders_are_on_disk_before_they_are_published_and_
     assert made.result.tracks.ids.tolist() == again.centre.view().ids.tolist()
     made.after(at_once=True)
     assert State(tmp_path).ended().tolist() == []
+
+
+def test_young_tracks_of_an_intensity_are_on_disk_before_they_are_published(tmp_path: Path) -> None:
+    """They have no local tracks by which they could be noted."""
+    config = CentreConfig(kind="intensity", lateness=3.0, confirm_hits=50, confirm_within=60)
+
+    def lasting() -> LastingCentre:
+        desk = OrderDesk(lambda order: None)
+        return LastingCentre(config, State(tmp_path), desk, BoundedLog(1.0), Counter(), lambda: None)
+
+    one = lasting()
+    one.handle(info("r"), START)
+    places = np.array([[0.0, 0.0, 10.0, 0.0], [5000.0, 0.0, 0.0, 10.0]])
+    shown: list[int] = []
+    for second in (1, 2, 3):
+        one.handle(intensity("r", second, places[: min(second, 2)]), START)
+        made = one.step(START + second * SECOND)
+        assert made is not None
+        assert made.result.picture.status.tolist() == [TENTATIVE] * min(second, 2)
+        shown = made.result.picture.ids.tolist()
+    assert lasting().centre.view().ids.tolist() == shown
 
 
 def test_a_step_that_fails_brings_no_ended_track_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

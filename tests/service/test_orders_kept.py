@@ -13,9 +13,10 @@ import pytest
 
 import schemas
 from fusion_service.centre import FusionCentre, Order
+from fusion_service.order import order_event
 from fusion_service.service.held import HeldOrders
 from fusion_service.service.ordering import OrderDesk
-from fusion_service.service.promises import MOST_WAITING, PATIENCE, Promises
+from fusion_service.service.promises import FOLLOWED, MOST_WAITING, PATIENCE, Promises
 from tests.helpers.processes import Hub, Program, eventually
 from tests.helpers.scene import Scene, opened
 
@@ -179,6 +180,7 @@ def test_promises_are_bounded_and_each_is_answered_once() -> None:
     assert promises.overdue() == []
     promises.settle([{"number": 1, "done": False, "outcome": "no"}], kept=True)
     promises.settle([{"number": 1, "done": True, "outcome": "yes"}], kept=True)
+    promises.release()
     promises.lose([orders[1]])
     now[0] = PATIENCE
     assert promises.wait() == 0.0
@@ -213,8 +215,9 @@ def test_a_certificate_proves_who_ordered_and_with_certificates_nobody_else_does
     centre.handle(order, 0)
     log = centre.step(10**18).log
     desk.follow(centre)
-    assert said == []
     desk.promises.settle(log.events, kept=True)
+    assert said == [], "its step is not published yet"
+    desk.promises.release()
     assert msgpack.unpackb(said.pop()) == {
         "number": 1,
         "done": True,
@@ -238,5 +241,39 @@ def test_a_process_that_lost_the_name_promises_nothing() -> None:
     promises.make(Order("mute", "r", number=1), "will be", said.append)
     promises.may = lambda: False
     promises.settle([{"number": 1, "done": True, "outcome": "yes"}], kept=True)
+    promises.release()
     [error] = said
     assert isinstance(error, ValueError)
+
+
+def test_an_answer_waits_for_who_stands_by_but_not_for_long() -> None:
+    now, known, said = [0.0], [0], list[Any]()
+    promises = Promises(lambda: now[0])
+    promises.followed = lambda: known[0]
+    orders = [Order("mute", "r", number=k) for k in range(1, 4)]
+    for order in orders:
+        promises.make(order, "will be", said.append)
+    promises.settle([{"number": k, "done": True, "outcome": "yes"} for k in (1, 2)], kept=True)
+    promises.release()
+    assert said == []
+    known[0] = 1
+    promises.release()
+    assert [msgpack.unpackb(one)["number"] for one in said] == [1]
+    assert promises.wait() == FOLLOWED
+    now[0] = FOLLOWED
+    promises.release()
+    assert [msgpack.unpackb(one).get("followed") for one in said] == [None, False]
+    # one that is answered though it waits for its step is told to others until that
+    now[0] = PATIENCE
+    assert promises.held() == []
+    promises.hold(promises.overdue(), kept=True)
+    assert promises.held() == [order_event(orders[2])]
+    promises.release()
+    assert len(said) == 2
+    known[0] = 3
+    promises.release()
+    assert msgpack.unpackb(said[-1])["pending"]
+    promises.settle([{"number": 3, "done": True, "outcome": "yes"}], kept=True)
+    promises.release()
+    assert len(said) == 3
+    assert promises.held() == []

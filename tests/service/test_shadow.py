@@ -61,7 +61,7 @@ class Watched:
 
     def held(self) -> list[int]:
         """The global tracks of a centre that begins with what the shadow holds."""
-        blob, ended = self.shadow.heritage()
+        blob, ended, _ = self.shadow.heritage()
         ids = FusionCentre(self.config, blob).view().ids
         return sorted(set(ids.tolist()) - set(ended.tolist()))
 
@@ -92,15 +92,17 @@ def test_with_steps_made_again_it_says_when_its_tracks_are_others(seed: int) -> 
     assert all(why == NONE or "gave other tracks" in why for why in watched.loads)
 
 
-def test_without_a_message_it_goes_on_from_its_checkpoint_without_what_ended() -> None:
+def test_without_a_message_it_goes_on_from_the_step_before_without_what_ended() -> None:
     watched = Watched(2, lost=(9,), revise=0.0)
     pictures = [watched.step() for _ in range(6)]
     watched.load(pictures[-1])
+    made = [watched.step() for _ in range(2)]
     first = set(watched.centre.view().ids.tolist())
-    later = [watched.step() for _ in range(8)]
+    later = [watched.step() for _ in range(6)]
     assert watched.shadow.wanted == "a message that step 9 took did not come here"
     assert watched.shadow.mark == (START, 8)
     ended = {track for one in later for track, _, _ in one.ended}
+    assert made[-1].step == 8
     assert first & ended
     assert set(watched.held()) == first - ended
 
@@ -118,7 +120,7 @@ def test_it_begins_with_nothing_and_takes_no_rubbish() -> None:
     shadow = Shadow(CentreConfig(), Clock())
     assert shadow.load(b"rubbish", (1, 1)).startswith("the checkpoint cannot be read")
     assert not shadow.ready
-    blob, ended = shadow.heritage()
+    blob, ended, _ = shadow.heritage()
     assert blob is None
     assert len(ended) == 0
     assert shadow.left(0) == []

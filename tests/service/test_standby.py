@@ -38,10 +38,6 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     assert second is not None
     before = watch.pictures[-1].targets
     assert main(["order", "rename", "--track", str(before[2]), "--name", "PILOT", "--connect", hub.endpoint]) == 0
-    eventually(lambda: "PILOT" in (watch.pictures[-1].picture.callsign or ()))
-    shown = len(watch.pictures)  # the log of a step comes after its picture: what it obeys is the other's with the next
-    eventually(lambda: len(watch.pictures) >= shown + 2)
-
     first.kill()
     killed = time.monotonic()
     number = len(watch.pictures) - 1
@@ -61,19 +57,14 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     assert seen.at - frozen < 3.0
     assert seen.targets == before
     second.signal(signal.SIGCONT)
-    eventually(watch.ready, 20)  # it stood down, and stands by
-    eventually(lambda: pair.active() == 0)
+    eventually(lambda: pair.active() == 0 and watch.ready(), 20)  # it stood down, and stands by
 
-    for _ in range(20):  # once the other is in step
-        number = len(watch.pictures) - 1
-        if main(["order", "handover", "--connect", hub.endpoint]) == 0:
-            break
-        time.sleep(0.5)
+    number = len(watch.pictures) - 1
+    assert main(["order", "handover", "--connect", hub.endpoint]) == 0
     seen = pair.taken_over(number)
     assert seen.targets == before
     assert seen.picture.time - watch.pictures[number].picture.time < 1.2e9
-    eventually(watch.ready, 20)
-    eventually(lambda: pair.active() == 1)
+    eventually(lambda: pair.active() == 1 and watch.ready(), 20)
     assert "PILOT" in (watch.pictures[-1].picture.callsign or ())
     assert watch.faults() == []
     assert set(watch.names()) == set(before.values())
@@ -128,13 +119,13 @@ def test_none_hands_over_to_nobody_and_all_to_one_of_other_settings(
     lonely: Program = pair.centre(1, standby=True)
     pair.sensor("r1", 0)
     pair.centre(0)
-    eventually(lambda: pair.watch.sees(0), 20)
+    eventually(lambda: pair.watch.sees(0), 40)  # three processes load
     eventually(pair.watch.ready, 20)
     lonely.kill()
     lonely.__exit__()
     eventually(lambda: not pair.watch.ready())
     assert main(["order", "handover", "--connect", hub.endpoint]) == 1
-    assert "no handover: nobody stands by with the newest state" in capsys.readouterr().err
+    assert "no handover: nobody stands by" in capsys.readouterr().err
     pair.centre(1, standby=True, more="gate = 0.98\n")  # an upgrade with other settings: it is copied, not followed
     eventually(pair.watch.ready, 20)
     before, number = pair.watch.pictures[-1].targets, len(pair.watch.pictures) - 1
