@@ -10,6 +10,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable
+from hashlib import sha1
 from importlib.util import find_spec
 from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
@@ -71,16 +72,33 @@ def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> No
 
 
 def is_kept() -> bool:
-    """Whether an earlier process has compiled all kernels as they are, as far as one can see beside them: one that was
-    killed has compiled the first of them only."""
+    """Whether an earlier process has compiled all kernels as they are, as far as one can see where numba would look:
+    one that was killed has compiled the first of them only."""
     return all(_kept(name) for name in SHAPES)
 
 
 def _kept(name: str) -> bool:
     source = Path(_home(name).__file__ or "")
+    place = _place(source)
     python = f"py{sys.version_info.major}{sys.version_info.minor}"
-    found = (source.parent / "__pycache__").glob(f"{source.stem}.{name}-*.{python}*.nbc")
+    found = place.glob(f"{source.stem}.{name}-*.{python}*.nbc") if place is not None else ()
     return any(one.stat().st_mtime >= source.stat().st_mtime for one in found)
+
+
+def _place(source: Path) -> Path | None:
+    """Where numba keeps what it makes of a source: the first place that can be written, even where there is nothing to
+    be written any more, so that what stands beside a source that is read-only is no use."""
+    folder = source.absolute().parent
+    apart = f"{folder.name}_{sha1(str(folder).encode(), usedforsecurity=False).hexdigest()}"
+    given, home = os.environ.get("NUMBA_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    places = [Path(given, apart)] if given else []
+    places += [folder / "__pycache__", Path(home).expanduser() / "numba" / apart]
+    return next((one for one in places if _can_be_written(one)), None)
+
+
+def _can_be_written(place: Path) -> bool:
+    there = next((one for one in (place, *place.parents) if one.exists()), place)
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
 def _home(name: str) -> ModuleType:
