@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
-from fusion_service.compiled import groups, kernels, three
+from fusion_service.compiled import groups, kernels, three, turns
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
 
@@ -103,7 +103,7 @@ def _can_be_written(place: Path) -> bool:
 
 def _home(name: str) -> ModuleType:
     """Where a kernel stands."""
-    return next(one for one in (kernels, groups, three) if hasattr(one, name))
+    return next(one for one in (kernels, groups, three, turns) if hasattr(one, name))
 
 
 def _installed() -> bool:
@@ -162,6 +162,7 @@ SHAPES = {
     "congruence_each": ((3, 3), (3,)),
     "intersect": ((2, 3, 0), (2, 3, 1, 2, 3, 1)),
     "from_start_of_three": ((4, 3, 1, 2, 1), (2, 3, 2, 2, 1, 1, 1)),
+    "jacobi": ((1, 1), (3,)),
 }
 """Numbers of axes of what each kernel reads, and then writes; 0: places (G, k). `solve` takes a flag at the end."""
 STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three")
