@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
-from fusion_service.compiled import groups, kernels, three, turns
+from fusion_service.compiled import groups, kernels, products, three, turns
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
 
@@ -25,6 +25,7 @@ __all__ = ["CHOICES", "PLAIN", "VARIABLE", "begin", "is_kept", "road", "use"]
 CHOICES = ("auto", "on", "off")
 VARIABLE = "FUSION_COMPILED"
 PLAIN = "plain"
+HOMES = (kernels, groups, three, turns, products)
 
 _LOCK = threading.Lock()
 _NAME = [PLAIN]
@@ -103,7 +104,7 @@ def _can_be_written(place: Path) -> bool:
 
 def _home(name: str) -> ModuleType:
     """Where a kernel stands."""
-    return next(one for one in (kernels, groups, three, turns) if hasattr(one, name))
+    return next(one for one in HOMES if hasattr(one, name))
 
 
 def _installed() -> bool:
@@ -163,6 +164,7 @@ SHAPES = {
     "intersect": ((2, 3, 0), (2, 3, 1, 2, 3, 1)),
     "from_start_of_three": ((4, 3, 1, 2, 1), (2, 3, 2, 2, 1, 1, 1)),
     "jacobi": ((1, 1), (3,)),
+    "product_of_all": ((3, 4), (2, 3, 1)),
 }
 """Numbers of axes of what each kernel reads, and then writes; 0: places (G, k). `solve` takes a flag at the end."""
 STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three")
@@ -170,6 +172,7 @@ STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three")
 HELPERS = {
     "intersect": ("_turned", "_lowered", "_sum", "_copied", "_solved"),
     "from_start_of_three": ("_larger", "_inverted", "_looked_at", "_least_of_three", "_sought"),
+    "product_of_all": ("_condition", "_summed"),
 }
 """What kernels call, in the order in which it is compiled."""
 

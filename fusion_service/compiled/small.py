@@ -24,7 +24,7 @@ def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     """By name, over these `kernels` (those of the module, compiled or as they are)."""
     return {
         **_inverses(kernels), **_factors(kernels), **_products(kernels), "intersect": _groups(kernels),
-        "from_start_of_three": _three(kernels), "jacobi": _turns(kernels),
+        "from_start_of_three": _three(kernels), "jacobi": _turns(kernels), "product_of_all": _whole(kernels),
     }  # fmt: skip
 
 
@@ -184,3 +184,16 @@ def _turns(kernels: SimpleNamespace) -> Callable[..., Any]:
         return turned.reshape(X.shape)
 
     return jacobi
+
+
+def _whole(kernels: SimpleNamespace) -> Callable[..., Any]:
+    def product_of_all(x: Floats, P: Floats) -> tuple[Floats, ...] | None:
+        """See `products.product_of_all`: what it writes."""
+        if not _fits(x, P):
+            return None
+        size, _, n = x.shape
+        made = np.empty((size, n)), np.empty((size, n, n)), np.empty(size)
+        kernels.product_of_all(np.ascontiguousarray(x), np.ascontiguousarray(P), *made)
+        return made
+
+    return product_of_all

@@ -28,7 +28,7 @@ def batch(n: int, size: int) -> Floats:
     """Symmetric matrices of many scales; some diagonal, of equal eigenvalues, zero, indefinite, NaN."""
     rng = np.random.default_rng(1000 * n + size)
     G = rng.normal(size=(n, n, size)) * 10.0 ** rng.uniform(-4, 4, (n, 1, size))
-    A = np.einsum("ikb,jkb->ijb", G, G)
+    A: Floats = np.einsum("ikb,jkb->ijb", G, G)
     for place, one in enumerate((np.eye(n), np.zeros((n, n)), np.diag(-np.arange(n) - 0.0), np.full((n, n), np.nan))):
         if size > place + 4:
             A[..., place + 2] = one
