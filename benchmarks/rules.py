@@ -1,4 +1,4 @@
-"""How fast the fusion rules are: `python -m benchmarks.rules [--quick]`.
+"""How fast the fusion rules are: `python -m benchmarks.rules [--quick] [--road on]`.
 
 Public layout in and out, one thread, its CPU time. Each rule is timed in turn with two yardsticks, and the
 best of several rounds of each is compared, since a shared machine drifts by more than the rules differ:
@@ -24,6 +24,7 @@ import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
 from fusion_service.arrays import Floats
+from fusion_service.compiled import CHOICES, use
 from fusion_service.rules import fuse
 
 Case = tuple[str, dict[str, Any]]
@@ -182,7 +183,12 @@ def measure(
 def main() -> None:
     parser = argparse.ArgumentParser(description="Speed of the fusion rules", epilog="python -m benchmarks.rules")
     parser.add_argument("--quick", action="store_true", help="n = 4 and N = 2 only")
-    quick = parser.parse_args().quick
+    parser.add_argument(
+        "--road", choices=CHOICES, default="off", help="small matrices by NumPy (off), or compiled (on)"
+    )
+    given = parser.parse_args()
+    quick, road = given.quick, use(given.road)
+    print(f"small matrices by {road}; load of the machine {os.getloadavg()[0]:.1f}")
     rng = np.random.default_rng(1)
     sizes = [(4, 2, B) for B in (1, 20, 1000, 10_000)]
     if not quick:

@@ -26,6 +26,7 @@ from fusion_service.centre.pictures import as_scan, source_of
 from fusion_service.centre.refusing import fault
 from fusion_service.centre.scans import size_of
 from fusion_service.centre.spared import Spared
+from fusion_service.centre.unplaced import Key, Unplaced
 from fusion_service.config import CentreConfig
 from fusion_service.order import Order
 from schemas import (
@@ -58,9 +59,6 @@ MOST_STEPS = 2000
 MOST_COMPONENTS = 1_000_000
 """Of the inputs that are kept."""
 MOST_OWED = 50_000
-
-Key = tuple[str, int, int, int]
-"""Source, epoch, number and digest of a message."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,7 +95,8 @@ def key_of(entry: Entry) -> Key:
 
 class History:
     """The newest steps of a centre. past: in order; late: messages put in their place since the start, by source,
-    and reordered, those of them that came after a later one; revised: steps made again since the start."""
+    and reordered, those of them that came after a later one; revised: steps made again since the start; unplaced: what
+    was late and stays where it came."""
 
     def __init__(self, config: CentreConfig) -> None:
         self._lateness = round(config.lateness * 1e9)
@@ -109,6 +108,7 @@ class History:
         self.late: Counter[str] = Counter()
         self.reordered: Counter[str] = Counter()
         self.revised = 0
+        self.unplaced = Unplaced()
         self._credit = 0.0
         self._calm = -1
         self._busy = 0
@@ -141,6 +141,7 @@ class History:
     def clear(self) -> None:
         """Nothing that was made so far is made again."""
         self.past, self._owed, self._size, self._credit, self._calm = [], {}, 0, 0.0, -1
+        self.unplaced.began = self.unplaced.cut = -1
 
     def find(self, intake: Intake, last: int) -> list[Late]:
         """The queued messages that a step until `last`, ns, should have taken, and that would be taken now."""
@@ -163,6 +164,7 @@ class History:
     def behind(self) -> None:
         """Steps were skipped, or data dropped: for `CALM` no step is made again, which would only cost more of them.
         What comes late in that time is used as it comes."""
+        self.unplaced.behind(self._owed)
         self._calm, self._owed = (self.past[-1].time if self.past else 0) + CALM, {}
 
     def start(self, late: Sequence[Late]) -> int | None:
@@ -171,9 +173,11 @@ class History:
         self._credit = min(self._credit + self._pace, max(float(len(self.past)), self._pace))
         first = next((i for i, one in enumerate(self.past) if one.state is not None), None)
         if first is None:
+            self.unplaced.gone(self._owed.items())
             self._owed = {}
             return None
         floor = self.past[first].before
+        self.unplaced.gone((key, due) for key, due in self._owed.items() if due <= floor)
         self._owed = {key: due for key, due in self._owed.items() if due > floor}
         dues = [one.due for one in late if one.due > floor] + list(self._owed.values())
         if late:
@@ -221,6 +225,7 @@ class History:
 
     def told_in(self, status: Status) -> Status:
         """A status with what was put in its place, and how many steps were made again, since the start."""
+        status = self.unplaced.told_in(status)
         if not self.late:
             return status
         queue = dict(status.queue) | {"late": self.late.total(), "revised": self.revised}
@@ -244,6 +249,7 @@ class History:
                 if owes and isinstance(event, (LocalTracks, LocalIntensity, GlobalTracks)):
                     self._owe(key, due, one.before)
         self.past.append(one)
+        self.unplaced.began = max(one.before, 0) if self.unplaced.began < 0 else self.unplaced.began
         self._size += one.size
         for old in self.past[:-RECENT][-BUSY:]:
             if not old.lasting:
@@ -251,14 +257,18 @@ class History:
         self._trim(one.time - self._window)
 
     def _owe(self, key: Key, due: int, before: int) -> None:
-        if before >= self._calm and before >= 0 and due <= before - self._just and len(self._owed) < MOST_OWED:
+        if before < 0 or due > before - self._just:
+            return
+        if before >= self._calm and len(self._owed) < MOST_OWED:
             self._owed[key] = due
+        else:
+            self.unplaced.behind((key,))
 
     def _trim(self, oldest: int) -> None:
         """Let go what no late message reaches any more, or there is no room for."""
         starts = [i for i, one in enumerate(self.past) if one.state is not None]
         if not starts:
-            self.past, self._size = [], 0
+            self._cut(len(self.past), 0)
             return
         cut = max((i for i in starts if self.past[i].before <= oldest), default=starts[0])
         size = self._size - sum(one.size for one in self.past[:cut])
@@ -266,9 +276,13 @@ class History:
             after = next((i for i in starts if i > cut), len(self.past))
             size -= sum(one.size for one in self.past[cut:after])
             cut = after
+            self.unplaced.cut = self.past[cut - 1].time
             if cut == len(self.past):
                 break
-        del self.past[:cut]
+        self._cut(cut, size)
+
+    def _cut(self, steps: int, size: int) -> None:
+        del self.past[:steps]
         self._size = size
 
 

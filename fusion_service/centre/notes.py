@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from fusion_service.config import CentreConfig
 from fusion_service.rules import RULES
 from fusion_service.ways import reason_words
 from schemas import Message
 
 __all__ = [
+    "UNPLACED",
     "ahead",
     "frame_refused",
     "frame_waiting",
@@ -16,6 +19,7 @@ __all__ = [
     "refusal",
     "stale",
     "unfit",
+    "unplaced",
     "waiting",
 ]
 
@@ -26,6 +30,15 @@ MENDS = {
     "increments": "a tracker of several models, or one whose covariances are edited, gives none",
 }
 """What to do, or what is behind it."""
+UNPLACED = "late messages that were used as they came, and not put in their places: "
+"""How the note begins that `unplaced` gives."""
+KEPT_OUT = {
+    "start": "from before this process began, whose steps it cannot make again",
+    "room": "of steps that were let go, since more is not kept: set a smaller lateness",
+    "turn": "whose turn did not come in time: set revise under [centre] higher, or delay, so that less is late",
+    "behind": "while the centre was behind",
+}
+"""What keeps late messages from being put in their places."""
 
 
 def refusal(reason: str, message: Message, last: int, received: int, config: CentreConfig) -> str:
@@ -91,3 +104,9 @@ def partial(space: tuple[str, ...], config: CentreConfig) -> str:
 def no_tracklets(why: str) -> str:
     """Its tracks go by the rule, not as tracklets, for the reason `why`."""
     return f"no tracklets of it: {reason_words(why)}" + (f": {MENDS[why]}" if why in MENDS else "")
+
+
+def unplaced(why: Mapping[str, int]) -> str:
+    """So many late messages, by what kept them from being put in their places, stay where they came."""
+    parts = "; ".join(f"{count} {KEPT_OUT[one]}" for one, count in sorted(why.items()))
+    return f"{UNPLACED}{parts}"

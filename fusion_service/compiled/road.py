@@ -10,12 +10,13 @@ import os
 import sys
 import threading
 from collections.abc import Callable
+from hashlib import sha1
 from importlib.util import find_spec
 from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
-from fusion_service.compiled import groups, kernels, three
+from fusion_service.compiled import groups, kernels, products, three, turns
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
 
@@ -25,6 +26,7 @@ CHOICES = ("auto", "on", "off")
 VARIABLE = "FUSION_COMPILED"
 THREAD = "compiler"
 PLAIN = "plain"
+HOMES = (kernels, groups, three, turns, products)
 
 _LOCK = threading.Lock()
 _NAME = [PLAIN]
@@ -72,21 +74,38 @@ def begin(choice: str, stop: threading.Event, told: Callable[[str], None]) -> No
 
 
 def is_kept() -> bool:
-    """Whether an earlier process has compiled all kernels as they are, as far as one can see beside them: one that was
-    killed has compiled the first of them only."""
+    """Whether an earlier process has compiled all kernels as they are, as far as one can see where numba would look:
+    one that was killed has compiled the first of them only."""
     return all(_kept(name) for name in SHAPES)
 
 
 def _kept(name: str) -> bool:
     source = Path(_home(name).__file__ or "")
+    place = _place(source)
     python = f"py{sys.version_info.major}{sys.version_info.minor}"
-    found = (source.parent / "__pycache__").glob(f"{source.stem}.{name}-*.{python}*.nbc")
+    found = place.glob(f"{source.stem}.{name}-*.{python}*.nbc") if place is not None else ()
     return any(one.stat().st_mtime >= source.stat().st_mtime for one in found)
+
+
+def _place(source: Path) -> Path | None:
+    """Where numba keeps what it makes of a source: the first place that can be written, even where there is nothing to
+    be written any more, so that what stands beside a source that is read-only is no use."""
+    folder = source.absolute().parent
+    apart = f"{folder.name}_{sha1(str(folder).encode(), usedforsecurity=False).hexdigest()}"
+    given, home = os.environ.get("NUMBA_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME") or "~/.cache"
+    places = [Path(given, apart)] if given else []
+    places += [folder / "__pycache__", Path(home).expanduser() / "numba" / apart]
+    return next((one for one in places if _can_be_written(one)), None)
+
+
+def _can_be_written(place: Path) -> bool:
+    there = next((one for one in (place, *place.parents) if one.exists()), place)
+    return there.is_dir() and os.access(there, os.W_OK | os.X_OK)
 
 
 def _home(name: str) -> ModuleType:
     """Where a kernel stands."""
-    return next(one for one in (kernels, groups, three) if hasattr(one, name))
+    return next(one for one in HOMES if hasattr(one, name))
 
 
 def _installed() -> bool:
@@ -145,6 +164,8 @@ SHAPES = {
     "congruence_each": ((3, 3), (3,)),
     "intersect": ((2, 3, 0), (2, 3, 1, 2, 3, 1)),
     "from_start_of_three": ((4, 3, 1, 2, 1), (2, 3, 2, 2, 1, 1, 1)),
+    "jacobi": ((1, 1), (3,)),
+    "product_of_all": ((3, 4), (2, 3, 1)),
 }
 """Numbers of axes of what each kernel reads, and then writes; 0: places (G, k). `solve` takes a flag at the end."""
 STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three")
@@ -152,6 +173,7 @@ STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three")
 HELPERS = {
     "intersect": ("_turned", "_lowered", "_sum", "_copied", "_solved"),
     "from_start_of_three": ("_larger", "_inverted", "_looked_at", "_least_of_three", "_sought"),
+    "product_of_all": ("_condition", "_summed"),
 }
 """What kernels call, in the order in which it is compiled."""
 

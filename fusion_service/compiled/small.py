@@ -13,16 +13,18 @@ import numpy as np
 
 from fusion_service.compiled.either import Floats, Places
 
-__all__ = ["functions"]
+__all__ = ["SWEEPS", "functions"]
 
 F8 = np.dtype(np.float64)
+SWEEPS = 30
+"""Of Jacobi's rotations, at most."""
 
 
 def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     """By name, over these `kernels` (those of the module, compiled or as they are)."""
     return {
         **_inverses(kernels), **_factors(kernels), **_products(kernels), "intersect": _groups(kernels),
-        "from_start_of_three": _three(kernels),
+        "from_start_of_three": _three(kernels), "jacobi": _turns(kernels), "product_of_all": _whole(kernels),
     }  # fmt: skip
 
 
@@ -170,3 +172,28 @@ def _three(kernels: SimpleNamespace) -> Callable[..., Any]:
         return made
 
     return from_start_of_three
+
+
+def _turns(kernels: SimpleNamespace) -> Callable[..., Any]:
+    def jacobi(X: Floats, floor: Floats, small: float) -> Floats | None:
+        """X, turned in place where it is contiguous."""
+        if not _fits(X, floor) or X.shape[2:] != floor.shape:
+            return None
+        turned = _flat(X, 2)
+        kernels.jacobi(np.ascontiguousarray(floor).reshape(-1), np.array([small, SWEEPS]), turned)
+        return turned.reshape(X.shape)
+
+    return jacobi
+
+
+def _whole(kernels: SimpleNamespace) -> Callable[..., Any]:
+    def product_of_all(x: Floats, P: Floats) -> tuple[Floats, ...] | None:
+        """See `products.product_of_all`: what it writes."""
+        if not _fits(x, P):
+            return None
+        size, _, n = x.shape
+        made = np.empty((size, n)), np.empty((size, n, n)), np.empty(size)
+        kernels.product_of_all(np.ascontiguousarray(x), np.ascontiguousarray(P), *made)
+        return made
+
+    return product_of_all

@@ -13,6 +13,7 @@ import numpy as np
 
 from fusion_service.geodesy import FrameError, transform
 from fusion_service.hints import tracks as about
+from fusion_service.hints.lateness import late_doubt
 from fusion_service.hints.times import clock_words, span, unit_of_time
 from schemas import Enu, Frame, LocalIntensity, LocalTracks, Message, SensorInfo
 
@@ -81,6 +82,10 @@ class Listened:
         """What is doubtful, a sentence each, with what mends it. frame: that of the picture, where there is one."""
         with np.errstate(all="ignore"):
             return [one for one in self._doubts(now, frame) if one]
+
+    def lateness(self, period: float, delay: float, lateness: float, again: bool) -> str:
+        """What is to be said where all of its newest scans come too late for their steps (see `late_doubt`)."""
+        return late_doubt(self._held, self._came, period=period, delay=delay, lateness=lateness, again=again)
 
     def _doubts(self, now: int, frame: Frame | None) -> list[str]:
         said = [*self._runs(), self._no_info(now), self._period(), self._clocks(now)]

@@ -8,8 +8,8 @@ weights only place the mean; uniform unless given.
 
 Two sources have a closed form. With U_1 = T T', U_2 = T diag(r) T' the least det is that of
 T diag(max(r, 1)) T'; the least trace is that of U_1 + (U_2 - U_1)_+, the positive part. For more, the
-problem is convex (det: in P^-1) and a barrier method finds P to a duality gap of `GAP`, from within; where rounding
-does not let it, in longdouble either, P is what joining them two by two gives: above all, if not the smallest.
+problem is convex (det: in P^-1) and a primal-dual method finds P to a duality gap of `GAP` (`weights.above`); where
+rounding does not let it, in longdouble either, P is what joining them two by two gives: above all, if not the smallest.
 
 Promise (max): conservative if one source is, that is, if for one i the truth given all estimates has mean
 x_i and covariance at most P_i. Li-AA's Lemmas 1 and 2 need just this; a covariance P_i that holds on average
@@ -19,21 +19,20 @@ over the estimates is not enough, least of all for min.
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats
-from fusion_service.linalg import condition, inner, total, trace
+from fusion_service.arrays import Floats
+from fusion_service.linalg import condition, total, trace
 from fusion_service.rules.base.block import Result, Sources, alone
-from fusion_service.rules.base.matrices import lower_inverse, spectral
+from fusion_service.rules.base.matrices import spectral
 from fusion_service.rules.base.options import CRITERION, Option, one_of
 from fusion_service.rules.base.rule import Rule
 from fusion_service.rules.base.scales import SCALES, in_scales
+from fusion_service.rules.weights.above import GAP, smallest_above
 from fusion_service.rules.weights.pencil import eigen, pencil
 
 __all__ = ["RULE", "cu"]
 
-GAP = 2e-10
-FACTOR = 8.0
-"""By how much the barrier is lowered each time."""
-ROUNDS = 400
+ENOUGH = 1e-6
+"""The gap that will do where rounding allows no less, in longdouble."""
 
 
 def cu(sources: Sources, weights: Floats | None, influence: bool, *, criterion: str, bound: str) -> Result:
@@ -90,100 +89,10 @@ def _join(criterion: str, U: Floats, W: Floats) -> tuple[Floats, Floats]:
 
 def _smallest(criterion: str, start: Floats, U: Floats) -> tuple[Floats, Floats]:
     """The smallest P (n, n, B) above every U (n, n, N, B), and the gap (B,); `start` is one above them."""
-    n, _, N, size = U.shape
-    L, d = linalg.ldl(start)
-    F = L * np.sqrt(d)
-    identity = np.zeros_like(start)
-    identity[range(n), range(n)] = 1.0
-    K, pivots = linalg.ldl(U)
-    G = linalg.product(lower_inverse(F)[:, :, None] + np.zeros_like(U), K * np.sqrt(pivots))  # G G' is at most I
-    if criterion == "det":
-        ends, X, C = G, 0.5 * identity, None
-    else:
-        ends, X = linalg.product(G, G.swapaxes(0, 1)), 2.0 * identity
-        C = linalg.product(F.swapaxes(0, 1), F)
-        C /= trace(C)
-    best, gap = np.array(X), np.full_like(start[0, 0], np.inf)
-    todo, t, stopped = np.arange(size), np.ones_like(gap), np.ones(size, dtype=np.bool_)
-    last = U.dtype != np.float64
-    for _ in range(ROUNDS):
-        X, done, stuck = _newton(X, ends, C, t)
-        final = t >= N * n / GAP
-        finished = (done & final) | stuck
-        best[..., todo[finished]] = X[..., finished]
-        gap[todo[finished]] = np.where(stuck, np.inf, N * n / t)[finished]
-        stopped[todo[finished]] = stuck[finished]
-        t = np.where(done & ~final, t * FACTOR, t)
-        keep = ~finished
-        if not keep.any():
-            break
-        todo, t, X, ends = todo[keep], t[keep], X[..., keep], ends[..., keep]
-        C = None if C is None else C[..., keep]
-    P = linalg.congruence(F, linalg.inverse(best) if criterion == "det" else best)
+    P, gap = smallest_above(criterion, start, U)
     size_of = linalg.logdet if criterion == "det" else trace
     new, old = size_of(P), size_of(start)
     no_worse = ~(old > new + 2.0 * GAP * (np.abs(new) if criterion == "trace" else 1.0))
-    no_worse |= stopped & last  # longdouble does not find it either: what is above all, if not the smallest
+    if U.dtype != np.float64:
+        no_worse |= ~(gap <= ENOUGH)  # longdouble does not find it either: what is above all, if not the smallest
     return np.where(no_worse, start, P), np.where(no_worse, 0.0, gap)
-
-
-def _slack(X: Floats, ends: Floats, C: Floats | None) -> Floats:
-    """S_i(X) (n, n, N, B) of `_newton`."""
-    if C is not None:
-        return X[:, :, None] - ends
-    inside = linalg.product(linalg.product(ends.swapaxes(0, 1), X[:, :, None]), ends)
-    return np.eye(len(X), dtype=X.dtype)[:, :, None, None] - 0.5 * (inside + inside.swapaxes(0, 1))
-
-
-def _newton(X: Floats, ends: Floats, C: Floats | None, t: Floats) -> tuple[Floats, Bools, Bools]:
-    """One damped Newton step of t c(X) - sum log det S_i(X); whether it was a small one, or none.
-
-    c is trace C X and S_i = X - ends_i, or, where C is None, c is -log det X and S_i = I - G_i' X G_i, G_i = ends_i:
-    X <= (G_i G_i')^-1 without the inverse, whose large elements would cost the digits of the small ones.
-    """
-    slack = _slack(X, ends, C)
-    V = linalg.inverse(slack)
-    if C is None:
-        V = linalg.product(linalg.product(ends, V), ends.swapaxes(0, 1))
-    slope = total(np.moveaxis(V, 2, 0)) * (1.0 if C is None else -1.0)
-    curved = [(V, np.ones_like(t))]
-    if C is None:
-        Y = linalg.inverse(X)
-        slope = slope - t * Y
-        curved.append((Y[:, :, None], t))
-    else:
-        slope = slope + t * C
-    n = len(X)
-    pairs = [(a, b) for a in range(n) for b in range(a + 1)]
-    twice = np.array([1.0 if a == b else 2.0 for a, b in pairs])
-    g = np.stack([slope[a, b] for a, b in pairs]) * twice[:, None]
-    first, second = np.array(pairs).T
-    both = 0.5 * twice[:, None] * twice
-    H = np.zeros((len(pairs), len(pairs), *t.shape), X.dtype)
-    for M, s in curved:
-        for i in range(M.shape[2]):
-            A = M[:, :, i]
-            square = A[first[:, None], first] * A[second[:, None], second]
-            square += A[first[:, None], second] * A[second[:, None], first]
-            square *= s
-            H += square
-    H *= both[..., None]
-    step = -linalg.solve(H, g)
-    decrement = np.sqrt(np.maximum(-total(g * step), 0.0))
-    D = np.empty_like(X)
-    for value, (a, b) in zip(step, pairs, strict=True):
-        D[a, b] = D[b, a] = value
-
-    def height(X: Floats) -> Floats:
-        room = total(linalg.logdet(_slack(X, ends, C)))
-        out: Floats = (t * inner(C, X) if C is not None else -t * linalg.logdet(X)) - room
-        return out
-
-    here, length = height(X), np.ones_like(t)
-    low = decrement < 0.25  # inside, a whole step is safe: the function is self-concordant
-    for _ in range(40):
-        good = height(X + length * D) <= here - 0.1 * length * decrement**2
-        if (good | low).all():
-            break
-        length = np.where(good | low, length, 0.5 * length)
-    return np.where(good | low, X + length * D, X), decrement < 0.05, ~(good | low)

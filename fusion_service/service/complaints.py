@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any, NamedTuple
 
+from fusion_service.centre.notes import UNPLACED
 from fusion_service.config import CentreConfig
 from fusion_service.hints import Finding, Listened, read_finding, refusal_finding
 from fusion_service.service.bounded import BoundedLog
@@ -52,6 +53,8 @@ class Complaints:
 
     def __init__(self, config: CentreConfig, told: BoundedLog) -> None:
         self._config = config
+        steps = config.clock == "wall" and config.trigger == "period"
+        self._on_time = (config.period, config.delay, config.lateness, config.revise > 0.0) if steps else None
         self._bounds = told
         self._often = BoundedLog(1.0)
         self._last: dict[str, dict[str, Any]] = {}
@@ -146,6 +149,8 @@ class Complaints:
                 doubts.append(
                     "it holds no liveliness token, so that nobody hears when it is gone: declare one on its .../alive"
                 )
+            if self._on_time and (late := one.lateness(*self._on_time)):
+                doubts.append(late)
             for doubt in doubts:
                 if self._often.allows(f"{name}: {doubt[:40]}", SELDOM):
                     self._say(f"source {name}: {doubt}")
@@ -156,6 +161,9 @@ class Complaints:
     def told_in(self, status: Status) -> Status:
         """A status with the last refusal of each source, its figures, and what is doubtful. On any thread."""
         out = dict(status.sources)
+        for note in status.notes or ():
+            if note.startswith(UNPLACED) and self._often.allows(UNPLACED, SELDOM):
+                self._say(note)
         for name, last in list(self._last.items()):
             if name in out or len(out) < MOST_NAMED:
                 out[name] = {**out.get(name, {}), "last_refusal": dict(last)}

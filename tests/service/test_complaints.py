@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import logging
 import time
+from dataclasses import replace
 
 import pytest
 
 import schemas
+from fusion_service.centre.notes import unplaced
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.complaints import MOST_BYTES, MOST_HEARD, MOST_NAMED, MOST_WAITING, Complaints
@@ -66,3 +68,30 @@ def test_the_same_refusal_is_counted_and_another_one_stands_instead() -> None:
     assert (last["reason"], last["count"], last["value"]) == ("source", 1, "b")
     told.refused("a", "repeat", None, NOW)
     assert told.told_in(STATUS).sources["a"]["last_refusal"]["reason"] == "source"
+
+
+def test_a_source_later_than_delay_is_told_of_in_status_and_log(caplog: pytest.LogCaptureFixture) -> None:
+    told = Complaints(CentreConfig(period=0.1, delay=0.05), BoundedLog(1.0))
+    arriving = Complaints(CentreConfig(period=0.1, delay=0.05, trigger="arrival"), BoundedLog(1.0))
+    for k in range(30):
+        one = message(k, (0.0, 0.0))
+        for each in (told, arriving):
+            each.heard("a", one, 100, one.time + 400_000_000)
+    with caplog.at_level(logging.WARNING):
+        told.think({"a": True}, None)
+        told.think({"a": True}, None)
+    said = [one for one in told.told_in(STATUS).sources["a"]["doubts"] if "set delay under [centre]" in one]
+    assert len(said) == 1
+    assert sum("set delay under [centre]" in record.message for record in caplog.records) == 1
+    arriving.think({"a": True}, None)
+    assert "set delay" not in str(arriving.told_in(STATUS).sources["a"].get("doubts"))
+
+
+def test_late_data_that_stay_where_they_came_are_told_of_in_the_log_once(caplog: pytest.LogCaptureFixture) -> None:
+    told = complaints()
+    status = replace(STATUS, notes=(unplaced({"start": 3}),))
+    with caplog.at_level(logging.WARNING):
+        told.told_in(status)
+        told.told_in(replace(STATUS, notes=(unplaced({"start": 4}),)))
+        told.told_in(STATUS)
+    assert [record.message for record in caplog.records] == [unplaced({"start": 3})]

@@ -61,6 +61,10 @@ class Rule(Declaration):
     information: bool = False
     """Whether it takes sources that do not know of all components, padded with variances so large that they are no
     information: its formula must be one of inverse covariances"""
+    at_once: Callable[[Floats, Floats], tuple[Floats, Floats, Floats] | None] | None = None
+    """A faster road, where there is one, from means (B, N, n) and covariances (B, N, n, n) to mean (B, n), covariance
+    (B, n, n) and condition (B,), NaN for what it cannot do: the same bits; for a rule without options and weights. None
+    where it cannot be taken now."""
     refusal: str = "is too ill-conditioned to fuse to within 1e-6"
     """Why a fusion of sound sources is refused."""
 

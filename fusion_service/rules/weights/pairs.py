@@ -290,7 +290,7 @@ def _newton(slope: Slope, c: Floats, n: int, rho: float | Floats, ends: tuple[Fl
             if not left:
                 break
             at = np.flatnonzero(busy)
-            todo, t, lo, hi, c, busy = todo[at], t[at], lo[at], hi[at], c[..., at], busy[at]
+            todo, t, lo, hi, c, busy = todo[at], t[at], lo[at], hi[at], c.take(at, axis=-1), busy[at]
             rho = of_elements(rho, at)
         h, dh = slope(t, c, n, rho)
         rising = h > 0.0

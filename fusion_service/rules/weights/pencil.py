@@ -8,12 +8,12 @@ import numpy as np
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats
+from fusion_service.compiled import either
+from fusion_service.compiled.small import SWEEPS
 from fusion_service.linalg import condition
 from fusion_service.rules.base.matrices import lower_inverse
 
-__all__ = ["eigen", "pencil"]
-
-SWEEPS = 30
+__all__ = ["eigen", "jacobi", "pencil"]
 
 
 def pencil(P1: Floats, P2: Floats) -> tuple[Floats, Floats, Floats, Floats]:
@@ -39,14 +39,22 @@ def eigen(A: Floats) -> tuple[Floats, Floats]:
     X[range(n, 2 * n), range(n)] = 1.0
     eps = 4.0 * np.finfo(A.dtype).eps
     floor = (eps * eps * np.abs(A).max(axis=(0, 1))) ** 2
+    X = jacobi(X, floor, eps * eps)
+    return X[range(n), range(n)], X[n:]
+
+
+@either
+def jacobi(X: Floats, floor: Floats, small: float) -> Floats:
+    """X (2n, n, B), a symmetric matrix above vectors, turned until the matrix is diagonal."""
+    n = X.shape[1]
     for _ in range(SWEEPS):
         turned = False
         for p in range(n):
             for q in range(p + 1, n):
-                turned = _turn(X, p, q, eps * eps, floor) or turned
+                turned = _turn(X, p, q, small, floor) or turned
         if not turned:
             break
-    return X[range(n), range(n)], X[n:]
+    return X + 0.0  # whether a zero is negative depended on what else is turned
 
 
 def _turn(X: Floats, p: int, q: int, small: float, floor: Floats) -> bool:
