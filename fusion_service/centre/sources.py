@@ -126,9 +126,10 @@ class Source:
         """Take the tracks of a complete scan, or of partial ones in a row; what a complete scan does not list is
         gone. versions: keep them. False, and nothing is changed, if there would be more than `most` tracks."""
         space, complete, end = messages[-1].space, messages[-1].complete, messages[-1].time
-        new = by_id(new.take(new.time >= self.complete))
         old = self.tracks if space == self.space else empty_tracks(len(space))
-        new = altered(new, interval=intervals(new.id, new.time, self._known(old), pace))
+        if len(new.id):
+            new = by_id(new.take(new.time >= self.complete))
+            new = altered(new, interval=intervals(new.id, new.time, self._known(old), pace))
         merged, stays, pair = renewed(old, new, versions)
         gone = old.link[:0]
         if complete and end >= self.complete and stays.any():
