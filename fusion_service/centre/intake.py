@@ -16,7 +16,7 @@ from fusion_service.centre import limits, notes
 from fusion_service.centre.batches import Checked, framed, run_key
 from fusion_service.centre.clock import horizon
 from fusion_service.centre.converting import Conversion
-from fusion_service.centre.declared import declared_by, loosened, motion_declared, pace_of, sensor_of
+from fusion_service.centre.declared import declared_by, motion_declared, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.events import Event, Refused, Skipped, SourceFound, SourceLost
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
@@ -378,15 +378,13 @@ class Intake:
                 source.why = notes.frame_waiting(name_frame(first.frame))
                 continue
             try:
-                messages, new = conversion.of(place)
-                new = loosened(new, messages[0].space, self.declared(source))
+                messages, new, pace, step = conversion.of(place)
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))
             else:
                 total -= len(source.tracks.id)
-                pace = self.pace(source, first.complete)
                 most, follow = min(limits.MAX_TOTAL - total, limits.MAX_TRACKS), self.config.follows
-                reason = "" if source.apply(messages, new, most, pace, follow) else "too-many-tracks"
+                reason = "" if source.apply(messages, new, most, pace, follow, step) else "too-many-tracks"
                 total += len(source.tracks.id)
             if reason:
                 for (_, message, entry), _ in batch:
