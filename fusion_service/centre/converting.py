@@ -147,7 +147,9 @@ class Conversion:
         usual = (old.id == new.id) & (old.time <= new.time) & (new.time >= complete)
         usual = np.logical_and.reduceat(usual, starts)
         same = old.origin == new.origin
-        kept = {name: np.where(same, getattr(old, name), getattr(new, name)) for name in LINKS}
+        kept = {name: getattr(old, name) for name in LINKS}
+        if not same.all():
+            kept = {name: np.where(same, column, getattr(new, name)) for name, column in kept.items()}
         later = same & (new.updated > old.updated)
         new = altered(new, interval=next_interval(old.interval, old.time, new.time, floor, cap), **kept)
         steps: dict[int, Step] = {}
@@ -170,12 +172,15 @@ def _may_go_on(source: Source, space: tuple[str, ...], size: int) -> bool:
 def _apart(tracks: Tracks, sizes: Sequence[int], known: Mapping[int, Step] = NOTHING_KNOWN) -> Iterator[Tracks]:
     """The tables that were made one, of so many tracks each: copies, which keep nothing of the others. known: those
     that are there already."""
-    nothing = empty_tracks(len(tracks.mean))
+    nothing: Tracks | None = None
     columns, start = columns_of(tracks), 0
     for place, size in enumerate(sizes):
         end = start + size
         if place in known:
             yield known[place].new
+        elif size:
+            yield made(Tracks, [column[..., start:end].copy() for column in columns])
         else:
-            yield made(Tracks, [column[..., start:end].copy() for column in columns]) if size else nothing
+            nothing = empty_tracks(len(tracks.mean)) if nothing is None else nothing
+            yield nothing
         start = end
