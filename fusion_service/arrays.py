@@ -9,7 +9,19 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Ints", "among", "constant", "find_sorted", "from_bytes", "marked", "picked", "subset", "to_bytes"]
+__all__ = [
+    "Bools",
+    "Floats",
+    "Ints",
+    "among",
+    "constant",
+    "find_sorted",
+    "from_bytes",
+    "marked",
+    "picked",
+    "subset",
+    "to_bytes",
+]
 
 Number = TypeVar("Number", bound=np.generic)
 Floats = NDArray[np.float64]

@@ -68,7 +68,9 @@ class Conversion:
             if place in self._ready:
                 table = self._ready.pop(place)
                 # the pace of a source that said something before in this step is another by now
-                return table if table.step is not None else table._replace(pace=self._intake.pace(source, first.complete))
+                return (
+                    table if table.step is not None else table._replace(pace=self._intake.pace(source, first.complete))
+                )
         said = self._intake.declared(source)
         messages = [with_height(one, said.height, frame, space) for (_, one, _), _ in self._runs[place]]
         sound = [faults == 0 for _, faults in self._runs[place]]
@@ -153,7 +155,9 @@ class Conversion:
         later = same & (new.updated > old.updated)
         new = altered(new, interval=next_interval(old.interval, old.time, new.time, floor, cap), **kept)
         steps: dict[int, Step] = {}
-        for k, fits, start, tracks in zip(some, usual.tolist(), starts.tolist(), _apart(new, counts.tolist()), strict=True):
+        for k, fits, start, tracks in zip(
+            some, usual.tolist(), starts.tolist(), _apart(new, counts.tolist()), strict=True
+        ):
             if fits:
                 newer, pair = later[start : start + len(tracks.id)], None
                 if self._intake.config.follows and newer.any():

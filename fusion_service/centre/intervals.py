@@ -20,7 +20,17 @@ from numpy.typing import NDArray
 
 from fusion_service.config import CentreConfig, SourceConfig
 
-__all__ = ["NOTHING_REMEMBERED", "Pace", "Remembered", "follow", "intervals", "next_interval", "remember", "silence", "silence_of"]
+__all__ = [
+    "NOTHING_REMEMBERED",
+    "Pace",
+    "Remembered",
+    "follow",
+    "intervals",
+    "next_interval",
+    "remember",
+    "silence",
+    "silence_of",
+]
 
 I64 = NDArray[np.int64]
 

@@ -129,7 +129,9 @@ def message_tracks(
     """
     first = messages[0]
     some = [None if rows.all() else rows for rows in sound]
-    counts = [len(rows) if part is None else int(np.count_nonzero(part)) for rows, part in zip(sound, some, strict=True)]
+    counts = [
+        len(rows) if part is None else int(np.count_nonzero(part)) for rows, part in zip(sound, some, strict=True)
+    ]
     gaussian = all(message.counts is None or message.weights is None for message in messages)
     if gaussian:
         means = _joined([_some(message.means, rows) for message, rows in zip(messages, some, strict=True)])
@@ -169,7 +171,8 @@ def message_tracks(
         updated=updated,
         interval=np.zeros(len(times), dtype=np.int64),
         **_told(messages, some, counts, said),
-        lineage=constant(len(times), ALONE, np.int32) if alone
+        lineage=constant(len(times), ALONE, np.int32)
+        if alone
         else _gather([lineages.of_message(m) for m in messages], some, np.int32),
         extent=extent,
         **unlinked(len(times)),

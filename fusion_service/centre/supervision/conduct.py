@@ -228,9 +228,7 @@ class Conduct:
                     self._warnings.raised((source.name, "identity-twice", text), time, numbers, sentence, journal)
         record.twice = seen
 
-    def _runs(
-        self, source: Source, record: _Record, time: int, journal: Journal, faded: dict[float, float]
-    ) -> None:
+    def _runs(self, source: Source, record: _Record, time: int, journal: Journal, faded: dict[float, float]) -> None:
         """Whether two runs of one source speak at once: counts of the last seconds, forgotten with time constant
         `HOLD`; faded: what is left of them by the seconds that have gone."""
         known = journal.refused_of.get(source.name)
