@@ -65,7 +65,7 @@ def in_order(labels: NDArray[np.uint64]) -> Ints:
 
 _Grouped: TypeAlias = tuple[NDArray[Any], Ints, list[tuple[NDArray[Any], Ints]]]
 _KEPT: list[_Grouped] = []
-"""The last few that were asked for: links stay as they are from step to step, and are asked for several times in one."""
+"""The last few that were asked for: links stay from step to step, and are asked for several times in one."""
 _MOST_KEPT = 2
 
 
