@@ -64,6 +64,7 @@ class Intake:
 
     def __init__(self, config: CentreConfig) -> None:
         self.config = config
+        self._nothing = empty_tracks(len(config.space))
         self.frame: Frame | None = config.frame
         self.voting = FrameVoting()
         self.reframed = False
@@ -165,7 +166,7 @@ class Intake:
 
     def nothing(self) -> Tracks:
         """No tracks, in the centre's space."""
-        return empty_tracks(len(self.config.space))
+        return self._nothing
 
     def declared(self, source: Source) -> SourceConfig:
         """What holds for a source: its own word, else the config's; with `override` the other way round."""
