@@ -3,12 +3,25 @@
 Where a docstring says that longdouble is taken too, `Floats` stands for it: NumPy's types tell no width apart there.
 """
 
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Bools", "Floats", "Ints", "among", "find_sorted", "from_bytes", "marked", "picked", "subset", "to_bytes"]
+__all__ = [
+    "Bools",
+    "Floats",
+    "Ints",
+    "among",
+    "constant",
+    "find_sorted",
+    "from_bytes",
+    "marked",
+    "picked",
+    "subset",
+    "to_bytes",
+]
 
 Number = TypeVar("Number", bound=np.generic)
 Floats = NDArray[np.float64]
@@ -50,6 +63,18 @@ def among(values: NDArray[np.integer[Any]], some: NDArray[np.integer[Any]]) -> B
     for one in some[1:]:
         found |= values == one
     return found
+
+
+def constant(count: int, value: float, kind: Any) -> NDArray[Any]:
+    """`np.full(count, value, kind)` that nobody writes to: the same array again where it is short."""
+    return _constant(count, value, kind) if count <= SMALL else np.full(count, value, dtype=kind)
+
+
+@lru_cache(maxsize=256)
+def _constant(count: int, value: float, kind: Any) -> NDArray[Any]:
+    column = np.full(count, value, dtype=kind)
+    column.flags.writeable = False
+    return column
 
 
 def marked(mask: Any) -> Ints:

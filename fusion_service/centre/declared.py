@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -63,10 +64,15 @@ def sensor_of(said: SourceConfig, info: SensorInfo | None, place: Place | None =
 def pace_of(said: SourceConfig, silent: bool, measured: int, config: CentreConfig) -> Pace:
     """Bounds of the intervals of a source's tracks. silent: nobody says anything of it; measured: the interval of its
     complete scans, ns, or -1."""
-    period = round(said.period * 1e9)
+    return _pace(said.period, silent, measured, config.remember, config.period)
+
+
+@lru_cache(maxsize=4096)
+def _pace(declared: float, silent: bool, measured: int, remember: float, step: float) -> Pace:
+    period = round(declared * 1e9)
     first = measured if measured > 0 else max(period, round(UNHEARD * 1e9)) if silent else period
-    cap = max(round(config.remember * 1e9), period)
-    floor = min(period, round(config.period * 1e9))
+    cap = max(round(remember * 1e9), period)
+    floor = min(period, round(step * 1e9))
     return Pace(min(max(first, floor), cap), floor, cap)
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, among
+from fusion_service.arrays import Bools, among, marked
 from fusion_service.centre.candidates import Pairs
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import NO_TRACK, Rows
@@ -29,7 +29,9 @@ def emptied(rows: Rows, before: Ids, believed: Bools, now: Picture, near: Pairs)
     the two apart by a row in each; and a row that had failed its gate tells nothing of the track that it left.
     """
     link = rows.tracks.link
-    moved = np.flatnonzero((link != before) & believed)
+    moved = marked((link != before) & believed)
+    if not len(moved):
+        return []
     left = np.unique(before[moved])
     left = left[~among(left, link) & among(left, now.id)]
     if not len(left):

@@ -21,6 +21,7 @@ each and their sum bounded by `MOST`.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,7 +34,6 @@ from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.partial import Unknown
 from fusion_service.centre.rows import Rows
-from fusion_service.config import SourceConfig
 from fusion_service.coverage import covers
 from fusion_service.densities import Mixtures, power_product
 from fusion_service.existence import fuse_existence
@@ -120,17 +120,18 @@ def update_existence(
     opinion = np.where(np.isnan(picture.opinion), _logit(config.birth_existence), picture.opinion)
     evidence = picture.evidence.copy()
     opinion = _opinions(rows, picture, inside[says], opinion, config.existence, Unknown.of(config.space))
-    gain = np.array([_gain(intake.declared(intake.sources[name])) for name in intake.names()])
+    said = (intake.declared(source) for _, source in sorted(intake.sources.items()))
+    gain = np.array([_gain(one.detection_probability, one.false_track) for one in said])
     counted = fresh & ~says
     np.add.at(evidence, at[counted], gain[rows.source[inside[counted]]])
     missed, spent = _missed(rows, picture, intake, entries, gain, time, shared)
     evidence = evidence - spent
-    evidence = np.clip(opinion + evidence, -MOST, MOST) - opinion
-    if before >= 0:
-        quiet = ~hit & (picture.time >= 0)
+    evidence = _within(opinion + evidence, MOST) - opinion
+    quiet = ~hit & (picture.time >= 0)
+    if before >= 0 and quiet.any():
         r = _sigmoid(opinion + evidence) * config.survival ** (max(time - before, 0) / 1e9)
-        evidence = np.where(quiet, np.clip(_logit(r), -MOST, MOST) - opinion, evidence)
-    total = np.clip(opinion + evidence + missed, -MOST, MOST)
+        evidence = np.where(quiet, _within(_logit(r), MOST) - opinion, evidence)
+    total = _within(opinion + evidence + missed, MOST)
     return altered(picture, opinion=opinion, evidence=evidence, existence=_sigmoid(total))
 
 
@@ -164,10 +165,16 @@ def _fused(rows: Rows, members: NDArray[np.intp], method: str, unknown: Unknown)
     return np.asarray(fuse_existence(inside, "geometric", overlap=np.clip(np.nan_to_num(overlap), 0.0, 1.0)))
 
 
-def _gain(declared: SourceConfig) -> float:
-    """log(p / f) of a new datum of a source, never below 0."""
-    p = USUAL_DETECTION if declared.detection_probability is None else declared.detection_probability
-    return float(np.log(max(p, declared.false_track) / declared.false_track))
+@lru_cache(maxsize=4096)
+def _gain(detection_probability: float | None, false_track: float) -> float:
+    """log(p / f) of a new datum of a source that declares them, never below 0."""
+    p = USUAL_DETECTION if detection_probability is None else detection_probability
+    return float(np.log(max(p, false_track) / false_track))
+
+
+def _within(x: Floats, most: float) -> Floats:
+    """`np.clip(x, -most, most)` without what that does beside it."""
+    return np.minimum(np.maximum(x, -most), most)
 
 
 def _missed(

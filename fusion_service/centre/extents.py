@@ -30,7 +30,7 @@ from fusion_service.geodesy import axis_turn, level_axes
 from fusion_service.records import altered
 from schemas import REFERENCES, SHAPES, Ecef, Frame, LocalTracks
 
-__all__ = ["BLOB", "message_extents", "off_centre", "shaped", "turned", "widened", "with_reference"]
+__all__ = ["BLOB", "message_extents", "off_centre", "shaped", "tells_extent", "turned", "widened", "with_reference"]
 
 BOX = SHAPES.index("box")
 CENTRE, ANTENNA, NEAREST, BLOB = range(len(REFERENCES))
@@ -46,14 +46,15 @@ def message_extents(
     messages: Sequence[LocalTracks], sound: Sequence[NDArray[np.bool_]], means: Floats, frame: Frame
 ) -> Floats:
     """The column (E, T) of the sound tracks of messages of one space and frame, whose means (n, T) are in `frame`."""
-    if not any(_tells(message) for message in messages):
+    if not any(tells_extent(message) for message in messages):
         return np.zeros((0, means.shape[1]))
     column = np.concatenate([_as_said(m, rows) for m, rows in zip(messages, sound, strict=True)], axis=1)
     first = messages[0]
     return _turned(column, axis_turn(means, first.space, first.frame, frame))
 
 
-def _tells(message: LocalTracks) -> bool:
+def tells_extent(message: LocalTracks) -> bool:
+    """Whether anything is said of the extents of its tracks, or of a reference point that is not their centre."""
     return not (message.extent is message.reference_covariances is None and message.reference in (None, "centre"))
 
 

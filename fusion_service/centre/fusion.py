@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among, marked
+from fusion_service.arrays import among, marked, subset
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
+from fusion_service.centre.association import in_order
 from fusion_service.centre.blobs import Blobs, Shared
 from fusion_service.centre.centre import Centre
 from fusion_service.centre.existence import Entries, update_existence
@@ -171,11 +172,11 @@ class FusionCentre(Centre):
 
     def _live(self, rows: Rows, shared: Shared, time: int) -> None:
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()
-        at = picture.find(tracks.link[inside])
+        at = picture.find(subset(tracks.link, inside))
         rows = kinship.new_only(rows, picture.updated, at, inside)
         updated, newest = picture.updated.copy(), np.full(len(picture.id), -1, dtype=np.int64)
-        np.maximum.at(updated, at, tracks.updated[inside])
-        np.maximum.at(newest, at, tracks.time[inside])
+        np.maximum.at(updated, at, subset(tracks.updated, inside))
+        np.maximum.at(newest, at, subset(tracks.time, inside))
         seen = np.maximum(picture.seen, newest)
         picture = altered(picture, updated=updated, seen=seen)
         picture = update_existence(rows, picture, self._intake, self._entries, time, self._last, shared)
@@ -196,19 +197,19 @@ class FusionCentre(Centre):
     ) -> Support:
         """What feeds each global track. A report is overdue by half of its interval, or a step, whichever is longer;
         where the source's token is gone, by nothing; where data of it were dropped, it is not."""
-        interval = rows.interval[inside]
+        interval = subset(rows.interval, inside)
         slack = np.maximum(interval // 2, round(self.config.period * 1e9))
-        expected = rows.tracks.seen[inside] + interval + np.where(rows.lost[inside], 0, slack)
-        expected = self._intake.spared.after_waking(expected, rows.tracks.time[inside], interval + slack)
+        expected = subset(rows.tracks.seen, inside) + interval + np.where(subset(rows.lost, inside), 0, slack)
+        expected = self._intake.spared.after_waking(expected, subset(rows.tracks.time, inside), interval + slack)
         spared = self._intake.spared.of(self._intake.names())
         if spared.any():
-            expected = np.where(spared[rows.source[inside]], np.maximum(expected, time), expected)
+            expected = np.where(spared[subset(rows.source, inside)], np.maximum(expected, time), expected)
         due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
         np.maximum.at(due, at, expected)
         np.maximum.at(slowest, at, interval)
         counted = kinship.separate(rows, inside)
         sources = np.bincount(at[(expected >= time) & counted], minlength=count)
-        hit = np.bincount(at[rows.fresh[inside]], minlength=count) > 0
+        hit = np.bincount(at[subset(rows.fresh, inside)], minlength=count) > 0
         linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
         whole = np.full(len(rows.source), -1, dtype=np.int64)
         whole[inside] = expected
@@ -219,6 +220,6 @@ class FusionCentre(Centre):
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()
-        inside = inside[np.argsort(tracks.link[inside], kind="stable")]
+        inside = inside[in_order(tracks.link[inside])]
         counts = np.bincount(picture.find(tracks.link[inside]), minlength=len(picture.id))
         return Contributions(counts, rows.source[inside], rows.epoch[inside], tracks.id[inside], influence[inside])

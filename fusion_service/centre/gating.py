@@ -72,28 +72,30 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     to it; forced: rows whose links no evidence breaks."""
     tracks, linked, tests = rows.tracks, rows.linked(), settings.tests
     links = tracks.link[linked]
-    fresh = rows.fresh[linked]
+    fresh = subset(rows.fresh, linked)
     predicted, seen = _from_prediction(rows, linked, now, time, settings)
     jumped = fresh & (predicted > tests.keep[seen])
-    outside = np.where(fresh, jumped, tracks.outside[linked])
+    outside = np.where(fresh, jumped, subset(tracks.outside, linked))
     some = marked(~outside if rows.out is None else ~outside & ~rows.out[linked])
     agreed = consensus(links[some], subset(tracks.mean, linked[some]), subset(tracks.covariance, linked[some]))
     distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
-    failed = _worst(links, fresh, distance, predicted, tracks.since[linked], distance > tests.keep[shared])
+    failed = _worst(links, fresh, distance, predicted, subset(tracks.since, linked), distance > tests.keep[shared])
     outside[failed] = True
     agreement, jump = tests.agreement(distance, shared), tests.jump(predicted, seen)
     _weigh(rows, linked, agreement, jump, jumped, agreed.groups, agreed.size, some, tests.bound)
     tracks.outside[linked] = outside
-    tracks.judged[linked] = np.where(fresh, tracks.updated[linked], tracks.judged[linked])
-    tracks.seen[linked] = np.where(fresh, time, tracks.seen[linked])
+    tracks.judged[linked] = np.where(fresh, subset(tracks.updated, linked), subset(tracks.judged, linked))
+    tracks.seen[linked] = np.where(fresh, time, subset(tracks.seen, linked))
     tracks.data[linked] += fresh
     may = fresh & ~among(linked, forced)
     broken, was = _break(rows, linked, links, may, distance, predicted, tests, journal)
-    stays = tracks.link[linked] != NO_TRACK
+    stays = subset(tracks.link, linked) != NO_TRACK
     shown = np.where(np.isnan(distance), np.where(outside, predicted, np.nan), distance)
     for kind, which in ((messages.KEPT, stays & ~outside), (messages.GATE_FAILED, stays & outside)):
-        journal.decide(kind, rows, linked[which], links[which], shown[which])
+        at = marked(which)
+        if len(at):
+            journal.decide(kind, rows, subset(linked, at), subset(links, at), subset(shown, at))
     inside = rows.inside()
     if len(inside) != len(some):
         agreed = _without(agreed, rows, linked[some], inside)
@@ -175,17 +177,18 @@ def _weigh(
     some: Ints, bound: float,
 ) -> None:  # fmt: skip
     """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
-    tracks, fresh = rows.tracks, rows.fresh[linked]
+    tracks, fresh = rows.tracks, subset(rows.fresh, linked)
     others = np.full(len(linked), -1, dtype=np.int64)
     others[some] = _newest_other(groups, tracks.updated[linked[some]])
     together = np.zeros(len(linked), dtype=np.bool_)
     together[some] = size > 1
-    weighed = fresh & together & ~jumped & (others > tracks.weighed[linked])
+    before = subset(tracks.weighed, linked)
+    weighed = fresh & together & ~jumped & (others > before)
     more = np.where(weighed, np.nan_to_num(agreement, nan=0.0), 0.0)
     more = np.where(fresh & ~together & ~jumped, bound / 4, more)
     more = np.where(jumped, jump, more)
-    tracks.evidence[linked] = np.clip(tracks.evidence[linked] + more, -bound, bound)
-    tracks.weighed[linked] = np.where(weighed, others, tracks.weighed[linked])
+    tracks.evidence[linked] = np.minimum(np.maximum(subset(tracks.evidence, linked) + more, -bound), bound)
+    tracks.weighed[linked] = np.where(weighed, others, before)
 
 
 def _newest_other(groups: list[Ints], updated: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -208,9 +211,9 @@ def _break(
     """Break what the sums have decided of the links that may break; of one global track only the row farthest from
     its prediction."""
     tracks = rows.tracks
-    ripe = may & (tracks.evidence[linked] <= -tests.bound + 1e-9)
+    ripe = may & (subset(tracks.evidence, linked) <= -tests.bound + 1e-9)
     shown = np.where(np.isnan(distance), predicted, distance)
-    worst = _worst(links, may, predicted, shown, tracks.since[linked], ripe)
+    worst = _worst(links, may, predicted, shown, subset(tracks.since, linked), ripe)
     if len(worst):
         journal.broke(rows, linked[worst], links[worst], shown[worst])
         again = among(links, links[worst])

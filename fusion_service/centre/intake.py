@@ -15,11 +15,11 @@ import numpy as np
 from fusion_service.centre import limits, notes
 from fusion_service.centre.batches import Checked, framed, run_key
 from fusion_service.centre.clock import horizon
-from fusion_service.centre.declared import declared_by, loosened, motion_declared, pace_of, sensor_of
+from fusion_service.centre.converting import Conversion
+from fusion_service.centre.declared import declared_by, motion_declared, pace_of, sensor_of
 from fusion_service.centre.era import ClockSet, NewEra, rebase_sources
 from fusion_service.centre.events import Event, Refused, Skipped, SourceFound, SourceLost
 from fusion_service.centre.frames import FrameVoting, Vote, may_be_picture, name_frame
-from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, silence_of
 from fusion_service.centre.journal import Journal
 from fusion_service.centre.lineage import Lineages
@@ -27,7 +27,7 @@ from fusion_service.centre.orders import Orders
 from fusion_service.centre.pictures import as_scan, is_picture_of, source_of
 from fusion_service.centre.refusing import fault
 from fusion_service.centre.resting import Resting, gone
-from fusion_service.centre.scans import Scan, as_tracks, message_tracks, size_of
+from fusion_service.centre.scans import Scan, as_tracks, size_of
 from fusion_service.centre.sources import Source
 from fusion_service.centre.spared import Spared
 from fusion_service.centre.sparing import affordable
@@ -64,6 +64,7 @@ class Intake:
 
     def __init__(self, config: CentreConfig) -> None:
         self.config = config
+        self._nothing = empty_tracks(len(config.space))
         self.frame: Frame | None = config.frame
         self.voting = FrameVoting()
         self.reframed = False
@@ -165,7 +166,7 @@ class Intake:
 
     def nothing(self) -> Tracks:
         """No tracks, in the centre's space."""
-        return empty_tracks(len(self.config.space))
+        return self._nothing
 
     def declared(self, source: Source) -> SourceConfig:
         """What holds for a source: its own word, else the config's; with `override` the other way round."""
@@ -366,35 +367,26 @@ class Intake:
         checked = affordable(checked, self.config, journal)
         self._settle_frame(checked, time, journal)
         checked = [((source, framed(one, self.frame), entry), faults) for (source, one, entry), faults in checked]
-        for _, run in groupby(enumerate(checked), key=run_key):
-            batch = [item for _, item in run]
+        runs = [[item for _, item in run] for _, run in groupby(enumerate(checked), key=run_key)]
+        conversion, total = Conversion(runs, self), sum(len(one.tracks.id) for one in self.sources.values())
+        for place, batch in enumerate(runs):
             source, first, _ = batch[0][0]
             for (_, _, entry), faults in batch:
                 for code in np.unique(faults[faults > 0]).tolist() if faults.any() else ():
                     journal.refuse(replace(entry, reason=FAULTS[code], count=int((faults == code).sum())))
-            sound = [faults == 0 for _, faults in batch]
-            messages = [message for (_, message, _), _ in batch]
             if self.frame is None and may_be_picture(first.frame, self.config.space):
-                source.leave("frame", sum(int(mask.sum()) for mask in sound))
+                source.leave("frame", sum(int((faults == 0).sum()) for _, faults in batch))
                 source.why = notes.frame_waiting(name_frame(first.frame))
                 continue
-            said = self.declared(source)
             try:
-                if self.frame is None:
-                    raise FrameError(notes.unfit(name_frame(first.frame), self.config.space))
-                messages = [with_height(one, said.height, self.frame, self.config.space) for one in messages]
-                most, words = self.config.max_components, (self.said, self.lineages)
-                new = message_tracks(messages, sound, self.frame, said.height, most, *words)
-                new = loosened(new, messages[0].space, said)
+                messages, new, pace, step = conversion.of(place)
             except FrameError as error:
                 reason, source.why = "frame", notes.frame_refused(str(error))
             else:
-                room = limits.MAX_TOTAL - sum(
-                    len(other.tracks.id) for other in self.sources.values() if other is not source
-                )
-                pace = self.pace(source, first.complete)
-                most, follow = min(room, limits.MAX_TRACKS), self.config.follows
-                reason = "" if source.apply(messages, new, most, pace, follow) else "too-many-tracks"
+                total -= len(source.tracks.id)
+                most, follow = min(limits.MAX_TOTAL - total, limits.MAX_TRACKS), self.config.follows
+                reason = "" if source.apply(messages, new, most, pace, follow, step) else "too-many-tracks"
+                total += len(source.tracks.id)
             if reason:
                 for (_, message, entry), _ in batch:
                     journal.refuse(replace(entry, reason=reason, count=len(message.ids)))

@@ -20,7 +20,17 @@ from numpy.typing import NDArray
 
 from fusion_service.config import CentreConfig, SourceConfig
 
-__all__ = ["NOTHING_REMEMBERED", "Pace", "Remembered", "follow", "intervals", "remember", "silence", "silence_of"]
+__all__ = [
+    "NOTHING_REMEMBERED",
+    "Pace",
+    "Remembered",
+    "follow",
+    "intervals",
+    "next_interval",
+    "remember",
+    "silence",
+    "silence_of",
+]
 
 I64 = NDArray[np.int64]
 
@@ -80,7 +90,7 @@ def intervals(id: NDArray[np.uint64], time: I64, known: Remembered, pace: Pace) 
     An id may be there several times: its newest report has what all of them give."""
     if (id[1:] > id[:-1]).all():
         interval, before = _before(id, known, pace)
-        return _after(interval, np.where(before >= 0, time - before, 0), pace)
+        return next_interval(interval, before, time, pace.floor, pace.cap)
     order = np.lexsort((time, id))
     ids, times = id[order], time[order]
     first = np.append(True, ids[1:] != ids[:-1])
@@ -93,7 +103,7 @@ def intervals(id: NDArray[np.uint64], time: I64, known: Remembered, pace: Pace) 
     now = interval[begin]
     for back in range(min(int(size.max()), MOST_GAPS) - 1, -1, -1):
         there = size > back
-        now = np.where(there, _after(now, gap[np.where(there, last - back, 0)], pace), now)
+        now = np.where(there, _after(now, gap[np.where(there, last - back, 0)], pace.floor, pace.cap), now)
     out = np.empty(len(ids), dtype=np.int64)
     out[order] = np.repeat(now, size)
     return out
@@ -111,10 +121,15 @@ def _before(ids: NDArray[np.uint64], known: Remembered, pace: Pace) -> tuple[I64
     return interval, before
 
 
-def _after(interval: I64, gap: I64, pace: Pace) -> I64:
+def next_interval(interval: I64, before: I64, time: I64, floor: I64 | int, cap: I64 | int) -> I64:
+    """The interval (T,) of tracks that had `interval`, after reports at `before`, -1 for none, and at `time`, ns."""
+    return _after(interval, np.where(before >= 0, time - before, 0), floor, cap)
+
+
+def _after(interval: I64, gap: I64, floor: I64 | int, cap: I64 | int) -> I64:
     """Intervals after one more gap each, ns; as they were where that is not positive."""
-    longer = np.maximum(np.maximum(gap, interval - (interval - gap) // 2), pace.floor)
-    return np.where(gap > 0, np.minimum(longer, pace.cap), interval)
+    longer = np.maximum(np.maximum(gap, interval - (interval - gap) // 2), floor)
+    return np.where(gap > 0, np.minimum(longer, cap), interval)
 
 
 def remember(known: Remembered, retired: Remembered, there: NDArray[np.uint64], oldest: int, most: int) -> Remembered:

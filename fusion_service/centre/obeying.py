@@ -47,6 +47,9 @@ def obey(
 ) -> Obeyed:
     """Let end what no longer stands at `time`, ns, of `step`, then obey the orders given, in the order of their
     coming."""
+    if not given and not intake.orders.standing:
+        intake.mute()
+        return Obeyed(picture, {})
     hands = _Hands(intake, picture, ids, journal, time, step)
     lasting = replace(hands.view(), ids=ids.known(picture.id))
     for one, why in intake.orders.expire(lasting):

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Floats, constant
 from fusion_service.centre.extents import message_extents
-from fusion_service.centre.lineage import Lineages
+from fusion_service.centre.lineage import ALONE, Lineages
 from fusion_service.centre.partial import transformed
 from fusion_service.centre.tracks import Tracks, no_parts, unlinked
 from fusion_service.centre.words import Lexicon
@@ -65,7 +65,6 @@ def fits(message: Scan) -> bool:
         return message.means.shape == (total, n) and message.covariances.shape == (total, n, n)
     tracks = len(message.ids)
     total = tracks if message.counts is None else int(np.sum(message.counts))
-    texts = [*(message.identity or ()), *(message.kind or ())]
     lengths = (message.existence, message.updated, message.counts, message.identity, message.kind, message.kind_p)
     return (
         message.means.shape == (total, n)
@@ -74,17 +73,27 @@ def fits(message: Scan) -> bool:
         and (message.weights is None or len(message.weights) == total)
         and _bits_fit(message)
         and _extents_fit(message)
-        and {*map(type, texts)} <= {str, type(None)}
+        and _texts_fit(message)
     )
 
 
+def _texts_fit(message: LocalTracks) -> bool:
+    if message.identity is message.kind is None:
+        return True
+    return {*map(type, (*(message.identity or ()), *(message.kind or ())))} <= {str, type(None)}
+
+
 def _bits_fit(message: LocalTracks) -> bool:
+    if message.track_lineage is None:
+        return True
     shape = len(message.ids), -(-len(message.lineage or ()) // 8)
-    return message.track_lineage is None or message.track_lineage.shape == shape
+    return message.track_lineage.shape == shape
 
 
 def _extents_fit(message: LocalTracks) -> bool:
     tracks, covariances = len(message.ids), message.reference_covariances
+    if message.extent is message.extent_sigma is covariances is None:
+        return True
     columns = (message.extent, message.extent_sigma)
     return all(column is None or column.shape == (tracks, 3) for column in columns) and (
         covariances is None or covariances.shape == (tracks, 2, 2)
@@ -119,13 +128,23 @@ def message_tracks(
     Raises `geodesy.FrameError` where their frame cannot be brought into `frame`.
     """
     first = messages[0]
-    means, covariances, weights, sizes = (
-        _joined(column) for column in zip(*map(_components, messages, sound), strict=True)
-    )
+    some = [None if rows.all() else rows for rows in sound]
+    counts = [
+        len(rows) if part is None else int(np.count_nonzero(part)) for rows, part in zip(sound, some, strict=True)
+    ]
+    gaussian = all(message.counts is None or message.weights is None for message in messages)
+    if gaussian:
+        means = _joined([_some(message.means, rows) for message, rows in zip(messages, some, strict=True)])
+        covariances = _joined([_some(message.covariances, rows) for message, rows in zip(messages, some, strict=True)])
+    else:
+        means, covariances, weights, sizes = (
+            _joined(column) for column in zip(*map(_components, messages, sound), strict=True)
+        )
+        gaussian = bool(sizes.max(initial=1) == 1)
     means, covariances = transformed(means, covariances, first.space, first.frame, frame, first.height or height)
-    if sizes.max(initial=1) == 1:
+    if gaussian:
         mean, covariance = linalg.to_last(means, 1), linalg.to_last(covariances, 2)
-        parts = no_parts(len(mean), len(sizes))
+        parts = no_parts(len(mean), len(means))
     else:
         mixtures = Mixtures.from_rows(weights, means, covariances, sizes).normalised()
         if len(mixtures.log_weights) > most:
@@ -133,10 +152,13 @@ def message_tracks(
         mean, covariance = mixtures.moments()
         parts = mixtures.log_weights, mixtures.means, linalg.symmetrise(mixtures.covariances)
     extent = message_extents(messages, sound, mean, frame)
-    some = [None if rows.all() else rows for rows in sound]
-    counts = [len(rows) if part is None else int(part.sum()) for rows, part in zip(sound, some, strict=True)]
     times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
-    updated = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
+    if all(m.updated is None for m in messages):
+        updated = times.copy()
+    else:
+        said_at = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
+        updated = np.minimum(_gather(said_at, some, np.int64), times)
+    alone = not any(m.lineage for m in messages)
     return Tracks(
         id=_gather([m.ids for m in messages], some, np.uint64),
         time=times,
@@ -146,10 +168,12 @@ def message_tracks(
         part_mean=parts[1],
         part_covariance=parts[2],
         existence=_optional([m.existence for m in messages], some, counts, np.nan, np.float64),
-        updated=np.minimum(_gather(updated, some, np.int64), times),
+        updated=updated,
         interval=np.zeros(len(times), dtype=np.int64),
         **_told(messages, some, counts, said),
-        lineage=_gather([lineages.of_message(m) for m in messages], some, np.int32),
+        lineage=constant(len(times), ALONE, np.int32)
+        if alone
+        else _gather([lineages.of_message(m) for m in messages], some, np.int32),
         extent=extent,
         **unlinked(len(times)),
     )
@@ -181,7 +205,7 @@ def _told(
 def _components(message: LocalTracks, sound: NDArray[np.bool_]) -> tuple[Floats, Floats, Floats, NDArray[np.intp]]:
     """Means, covariances and weights of the components of the sound tracks, and how many each of these has."""
     if message.counts is None or message.weights is None:
-        means, covariances = _some(message.means, sound), _some(message.covariances, sound)
+        means, covariances = message.means[sound], message.covariances[sound]
         return means, covariances, np.ones(len(means)), np.ones(len(means), dtype=np.intp)
     counts = message.counts.astype(np.intp)
     rows = np.repeat(sound, counts)
@@ -193,7 +217,7 @@ def _optional(
 ) -> NDArray[Any]:
     """The column of what messages may leave out: there as usual."""
     if all(column is None for column in columns):
-        return np.full(sum(counts), usual, dtype=kind)
+        return constant(sum(counts), usual, kind)
     parts = [
         np.full(count, usual, dtype=kind) if column is None else column if mask is None else column[mask]
         for column, mask, count in zip(columns, some, counts, strict=True)
@@ -207,9 +231,9 @@ def _gather(columns: Sequence[NDArray[Any]], some: Sequence[Mask], kind: Any) ->
     return np.concatenate(parts).astype(kind, copy=False)
 
 
-def _some(column: NDArray[Any], mask: NDArray[np.bool_]) -> NDArray[Any]:
+def _some(column: NDArray[Any], mask: Mask) -> NDArray[Any]:
     """The rows of the mask; the column itself where that is all of them."""
-    return column if mask.all() else column[mask]
+    return column if mask is None else column[mask]
 
 
 def _joined(columns: Sequence[NDArray[Any]]) -> NDArray[Any]:

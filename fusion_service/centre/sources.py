@@ -14,7 +14,7 @@ from fusion_service.arrays import among
 from fusion_service.centre.frames import Vote
 from fusion_service.centre.intervals import NOTHING_REMEMBERED, Pace, Remembered, follow, intervals
 from fusion_service.centre.places import Place, followed
-from fusion_service.centre.tracks import Pair, Tracks, by_id, empty_tracks, join_tracks, renewed
+from fusion_service.centre.tracks import Pair, Step, Tracks, by_id, empty_tracks, join_tracks, renewed
 from fusion_service.config import SourceConfig
 from fusion_service.records import altered
 from schemas import LocalTracks, SensorInfo
@@ -121,15 +121,20 @@ class Source:
         self.offset, self.lag = received - time, max(late, self.lag - (self.lag - late) // 8)
 
     def apply(
-        self, messages: Sequence[LocalTracks], new: Tracks, most: int, pace: Pace, versions: bool = False
-    ) -> bool:
+        self, messages: Sequence[LocalTracks], new: Tracks, most: int, pace: Pace, versions: bool = False,
+        step: Step | None = None,
+    ) -> bool:  # fmt: skip
         """Take the tracks of a complete scan, or of partial ones in a row; what a complete scan does not list is
-        gone. versions: keep them. False, and nothing is changed, if there would be more than `most` tracks."""
+        gone. versions: keep them. step: the one to the next table, where it is known already. False, and nothing is
+        changed, if there would be more than `most` tracks."""
         space, complete, end = messages[-1].space, messages[-1].complete, messages[-1].time
-        new = by_id(new.take(new.time >= self.complete))
         old = self.tracks if space == self.space else empty_tracks(len(space))
-        new = altered(new, interval=intervals(new.id, new.time, self._known(old), pace))
-        merged, stays, pair = renewed(old, new, versions)
+        if step is None:
+            if len(new.id):
+                new = by_id(new.take(new.time >= self.complete))
+                new = altered(new, interval=intervals(new.id, new.time, self._known(old), pace))
+            step = renewed(old, new, versions)
+        merged, stays, pair = step
         gone = old.link[:0]
         if complete and end >= self.complete and stays.any():
             listed = ~stays | (old.time > end)

@@ -24,6 +24,7 @@ __all__ = [
     "LINKS",
     "Columns",
     "Pair",
+    "Step",
     "Tracks",
     "as_mixtures",
     "by_id",

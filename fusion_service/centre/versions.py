@@ -99,9 +99,12 @@ def _by_source(intake: Intake, rows: Rows) -> Iterator[_Part]:
         source, ids = intake.sources[name], rows.tracks.id[start : start + count]
         if source.pairs and count:
             old, new = (_densities([pair[side] for pair in source.pairs]) for side in (0, 1))
-            at = np.minimum(find_sorted(ids, new.id), count - 1)
-            known = ids[at] == new.id
-            old, new, at = _thinned(old.take(known), new.take(known), at[known])
+            if len(new.id) == count and (new.id == ids).all():
+                at: Ints = np.arange(count)
+            else:
+                at = np.minimum(find_sorted(ids, new.id), count - 1)
+                known = ids[at] == new.id
+                old, new, at = _thinned(old.take(known), new.take(known), at[known])
             said = intake.declared(source)
             if len(at):
                 part = at + start, said.motion, source.space, said.inflation, intake.treatment(name)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -74,18 +75,20 @@ class Record:
     def bounds(self) -> tuple[float, float]:
         """What the ratio lies within by chance (Wilson, Hilferty 1931: the cube root of a mean of squares is nearly
         Gaussian), or without mattering."""
-        part = 2.0 / (9.0 * max(self.freedom, 1.0))
-        low, high = ((max(1.0 - part + side * SIGMAS * math.sqrt(part), 0.0)) ** 3 for side in (-1, 1))
-        return min(low, 1.0 - MATTERS), max(high, 1.0 + MATTERS)
+        return _bounds(self.freedom)
 
     @property
     def inflation(self) -> float:
         """What its increments are to be divided by."""
+        if not self.freedom > 0:
+            return 1.0
         return self.ratio if self.ratio > self.bounds[1] else 1.0
 
     @property
     def fails(self) -> bool:
         """Whether its increments are not to be taken at all."""
+        if not self.freedom > 0:
+            return False
         low, high = self.bounds
         return self.ratio > max(high, WORST) or self.ratio < min(low, LEAST)
 
@@ -107,6 +110,13 @@ class Record:
         kept = min(1.0, REMEMBERED / (self.versions + versions)) if versions > 0 else 1.0
         self.versions, self.taken = kept * (self.versions + versions), kept * (self.taken + taken)
         self.sound = kept * (self.sound + sound)
+
+
+@lru_cache(maxsize=4096)
+def _bounds(freedom: float) -> tuple[float, float]:
+    part = 2.0 / (9.0 * max(freedom, 1.0))
+    low, high = ((max(1.0 - part + side * SIGMAS * math.sqrt(part), 0.0)) ** 3 for side in (-1, 1))
+    return min(low, 1.0 - MATTERS), max(high, 1.0 + MATTERS)
 
 
 class Watch:

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Ints, from_bytes, to_bytes
+from fusion_service.arrays import Bools, Ints, from_bytes, to_bytes
 from fusion_service.centre.existence import Entries
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
@@ -34,6 +34,7 @@ from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.sources import Source
 from fusion_service.centre.stated_registration import shift_of
+from fusion_service.centre.supervision.crowd import COLUMNS, Seen, Told, counted, seen_together
 from fusion_service.centre.supervision.moves import Moves, Snapshot, moves
 from fusion_service.centre.supervision.warnings import HOLD, Warnings
 from fusion_service.centre.words import NONE
@@ -55,9 +56,7 @@ SEEN = 20.0
 """Seconds for which a source has reported what nobody else sees: what comes of clutter is gone by then."""
 MOST_TWICE = 50
 REFUSED = "older-run"
-COLUMNS: dict[str, type[np.generic]] = {
-    "id": np.uint64, "repeats": np.int64, "varied": np.int64, "since": np.int64, "jumps": np.int64, "last": np.int64,
-}  # fmt: skip
+NOBODY: Bools = np.zeros(0, dtype=np.bool_)
 
 
 @dataclass(slots=True)
@@ -95,25 +94,41 @@ class Conduct:
             return
         self._records = {name: self._records.get(name, _Record()) for name in names}
         self._refused = {name: self._refused[name] for name in names if name in self._refused}
+        came = {name: one for name in names if (one := self._told(name)) is not None}
+        hold = int(HOLD * 1e9)
+        seen = seen_together([*came.values()], self._intake.frame, self._intake.config, time, hold, VARIED, FEW)
+        faded: dict[float, float] = {}
         for name in names:
             source, record = self._intake.sources[name], self._records[name]
-            before = self._before.get(name)
-            if source.arrived and before is not None and before.tracks is not source.tracks:
-                shift = shift_of(self._intake, source)
-                some = [] if shift is None else [float(shift[k, k]) for k in self._places]
-                found = moves(
-                    before, source, self._intake.frame, float(np.sqrt(max(some, default=0.0))), self._intake.config
-                )
-                self._stuck_and_jumps(source, record, found, time, journal)
-                self._twice(source, record, found, time, journal)
-            self._runs(source, record, time, journal)
+            if name in came:
+                one = seen.get(name) or self._alone_seen(came[name], time)
+                record.columns = one.counts
+                if one.moves is not None:
+                    self._stuck_and_jumps(source, one, time, journal)
+                if one.moves is not None and one.named:
+                    self._twice(source, record, one.moves, time, journal)
+                else:
+                    record.twice = {}
+            self._runs(source, record, time, journal, faded)
         self._snapshot()
 
-    def _snapshot(self) -> None:
-        self._before = {name: Snapshot.of(one, self._intake.frame) for name, one in self._intake.sources.items()}
+    def _told(self, name: str) -> Told | None:
+        """A source that told of its tracks in this step, and has before."""
+        source, before = self._intake.sources[name], self._before.get(name)
+        if not source.arrived or before is None or before.tracks is source.tracks:
+            return None
+        shift = shift_of(self._intake, source)
+        some = [] if shift is None else [float(shift[k, k]) for k in self._places]
+        sigma = float(np.sqrt(max(some))) if some else 0.0
+        return Told(source, before, self._records[name].columns, sigma)
 
-    def _stuck_and_jumps(self, source: Source, record: _Record, found: Moves, time: int, journal: Journal) -> None:
-        tracks, old = source.tracks, record.columns
+    def _alone_seen(self, told: Told, time: int) -> Seen:
+        """What a source did that is not as it was."""
+        source, old = told.source, told.counts
+        tracks = source.tracks
+        if not len(tracks.id) and not len(old["id"]):
+            return Seen(None, old, NOBODY, False)
+        found = moves(told.before, source, self._intake.frame, told.shift, self._intake.config)
         new = {name: np.zeros(len(tracks.id), kind) for name, kind in COLUMNS.items()}
         new["id"] = tracks.id
         if np.array_equal(old["id"], tracks.id):
@@ -123,25 +138,20 @@ class Conduct:
             known = old["id"][place] == tracks.id
             for name in COLUMNS:
                 new[name][known] = old[name][place[known]]
-        at = found.at
-        before = self._before[source.name].tracks
-        first, ended, varied = before.time[found.was], new["repeats"][at] > 0, new["varied"][at]
-        new["since"][at] = np.where(found.again & ended, new["since"][at], first)
-        new["repeats"][at] = np.where(found.again, new["repeats"][at] + 1, 0)
-        new["varied"][at] = np.where(found.again, varied, np.where(ended, 1, varied + 1))
-        if new["jumps"].any():
-            new["jumps"][time - new["last"] > HOLD * 1e9] = 0
-        settled = (varied >= VARIED) | (new["jumps"][at] > 0) | (tracks.identity[at] != NONE)
-        jumped = found.jumped & settled
-        if jumped.any() or found.jumped.any():
-            new["varied"][at[found.jumped]] = 0
-            new["jumps"][at[jumped]] += 1
-            new["last"][at[jumped]] = time
-        record.columns = new
-        if (new["repeats"][at] >= FEW).any():
+        first = told.before.tracks.time[found.was]
+        jumped = counted(new, found.at, found, first, tracks.identity, time, int(HOLD * 1e9), VARIED)
+        return Seen(found, new, jumped, bool((tracks.identity != NONE).any()))
+
+    def _snapshot(self) -> None:
+        self._before = {name: Snapshot.of(one, self._intake.frame) for name, one in self._intake.sources.items()}
+
+    def _stuck_and_jumps(self, source: Source, seen: Seen, time: int, journal: Journal) -> None:
+        found, new = seen.moves, seen.counts
+        assert found is not None
+        if (new["repeats"][found.at] >= FEW).any():
             self._stuck(source, new, found, time, journal)
-        if jumped.any():
-            self._jumped(source, new, found._replace(jumped=jumped), time, journal)
+        if seen.jumped.any():
+            self._jumped(source, new, found._replace(jumped=seen.jumped), time, journal)
 
     def _stuck(
         self, source: Source, new: dict[str, NDArray[Any]], found: Moves, time: int, journal: Journal
@@ -192,9 +202,6 @@ class Conduct:
     def _twice(self, source: Source, record: _Record, found: Moves, time: int, journal: Journal) -> None:
         """One identity in two tracks of one source, neither overdue, and one with new data."""
         tracks = source.tracks
-        if not (tracks.identity != NONE).any():
-            record.twice = {}
-            return
         recent = source.last - tracks.time <= tracks.interval + tracks.interval // 2
         named = np.flatnonzero((tracks.identity != NONE) & recent)
         code = tracks.identity[named]
@@ -221,15 +228,17 @@ class Conduct:
                     self._warnings.raised((source.name, "identity-twice", text), time, numbers, sentence, journal)
         record.twice = seen
 
-    def _runs(self, source: Source, record: _Record, time: int, journal: Journal) -> None:
+    def _runs(self, source: Source, record: _Record, time: int, journal: Journal, faded: dict[float, float]) -> None:
         """Whether two runs of one source speak at once: counts of the last seconds, forgotten with time constant
-        `HOLD`."""
+        `HOLD`; faded: what is left of them by the seconds that have gone."""
         known = journal.refused_of.get(source.name)
         refused = 0 if known is None else known["old-epoch"]
         more = refused - self._refused.get(source.name, refused)
         self._refused[source.name] = refused
         gone = max(time - record.time, 0) / 1e9 if record.time >= 0 else 0.0
-        stays = float(np.exp(-gone / HOLD))
+        if gone not in faded:
+            faded[gone] = float(np.exp(-gone / HOLD))
+        stays = faded[gone]
         messages, reordered = (
             max(now - was, 0) for now, was in zip((source.messages, source.reordered), record.counted, strict=True)
         )

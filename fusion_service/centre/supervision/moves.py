@@ -27,7 +27,7 @@ from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig
 from schemas import Frame
 
-__all__ = ["Moves", "Snapshot", "moves"]
+__all__ = ["Change", "Moves", "Snapshot", "judged", "moves"]
 
 AXES = (("x", "vx"), ("y", "vy"), ("z", "vz"))
 SIGMAS = 5.0
@@ -85,19 +85,39 @@ def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, conf
             picked(before.covariance, was),
             picked(new.covariance, at),
         )
+    dt = (new.time[at] - before.time[was]) / 1e9
+    return Moves(at, *judged(Change(x, y, P, R, dt, before.interval[was]), source.space, shift, config), was)
+
+
+class Change(NamedTuple):
+    """K new versions and the ones before: mean before (n, K) and now; covariance before (n, n, K) and now; seconds (K,)
+    between them; interval (K,), ns, of the ones before."""
+
+    before: Floats
+    now: Floats
+    spread_before: Floats
+    spread_now: Floats
+    dt: Floats
+    interval: NDArray[np.int64]
+
+
+def judged(
+    change: Change, space: tuple[str, ...], shift: float, config: CentreConfig
+) -> tuple[Bools, Floats, Floats, Bools, Floats]:
+    """again, speed, sigma, jumped and away of `Moves`, each (K,); every one of a version by itself."""
+    x, y, P, R, dt, interval = change
     again = np.asarray((x == y).all(axis=0))
     if again.any():
         again[again] = (P[:, :, again] == R[:, :, again]).all(axis=(0, 1))
-    dt = (new.time[at] - before.time[was]) / 1e9
-    limit = Unknown.of(source.space).limit
-    away, spread, speed, sigma = np.zeros((4, count))
+    limit = Unknown.of(space).limit
+    away, spread, speed, sigma = np.zeros((4, len(dt)))
     for axis, rate in AXES:
-        if axis not in source.space:
+        if axis not in space:
             continue
-        k = source.space.index(axis)
-        off, wide = y[k] - x[k], np.full(count, (TIMES * config.unknown_speed / SIGMAS) ** 2)
-        if rate in source.space:
-            i = source.space.index(rate)
+        k = space.index(axis)
+        off, wide = y[k] - x[k], np.full(len(dt), (TIMES * config.unknown_speed / SIGMAS) ** 2)
+        if rate in space:
+            i = space.index(rate)
             known = P[i, i] < limit[i]
             v, wide = np.where(known, x[i], 0.0), np.where(known, P[i, i], wide)
             off = off - v * dt
@@ -108,8 +128,8 @@ def moves(old: Snapshot, source: Source, frame: Frame | None, shift: float, conf
         sigma += np.where(counts, R[k, k], 0.0)
     moved = np.sqrt(away)
     far = SIGMAS * np.sqrt(spread) + TIMES * config.manoeuvre * dt * dt / 2
-    held = dt <= PAUSE * np.maximum(before.interval[was], 1) / 1e9
-    return Moves(at, again, np.sqrt(speed), np.sqrt(sigma), held & (moved > far) & np.isfinite(far), moved, was)
+    held = dt <= PAUSE * np.maximum(interval, 1) / 1e9
+    return again, np.sqrt(speed), np.sqrt(sigma), held & (moved > far) & np.isfinite(far), moved
 
 
 def _later(before: Tracks, new: Tracks) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
