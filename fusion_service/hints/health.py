@@ -40,10 +40,10 @@ BENIGN = ("repeat", "muted")
 
 
 class Row(NamedTuple):
-    """A source. state: one of `STATES`; trust: as supervision says, or ""; rate: messages a second; period: declared, s;
-    latency, clock: s; share: of its tracks that others have too; refused: messages and tracks, since the start; gaps:
-    lost ones; reason: of its last refusal, where that was lately; faults: what is wrong, a sentence each; more: what
-    else is known of it; ignored: its faults do not count."""
+    """A source. state: one of `STATES`; trust: as supervision says, or ""; rate: messages a second; period: declared,
+    s; latency, clock: s; share: of its tracks that others have too; refused: messages and tracks, since the start;
+    gaps: lost ones; reason: of its last refusal, where that was lately; faults: what is wrong, a sentence each; more:
+    what else is known of it; ignored: its faults do not count."""
 
     name: str
     state: str
