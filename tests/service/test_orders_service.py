@@ -46,7 +46,8 @@ def test_an_operator_orders_lists_and_withdraws(scene: Scene, capsys: pytest.Cap
     code, _, err = order("delete", "--track", "PILOTS")
     assert code == 1
     assert "order 3 is refused: there is no track PILOTS: known are " in err
-    assert str(track) in err
+    assert "12 (PILOT)" in err
+    assert err.endswith(': did you mean "PILOT"?\n')
     code, out, _ = order("list")
     assert code == 0
     assert [line.split()[:2] for line in out.splitlines()] == [["1", "rename"], ["2", "quarantine"]]
