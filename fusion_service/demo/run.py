@@ -91,8 +91,8 @@ def run_demo(
     load_config(config)
     takes = plan.seconds / speed + START
     print(
-        f"{scenario}: {plan.seconds:.0f} s of mission at {speed:g} times real time, which takes {takes:.0f} s, and a few "
-        f"to begin and end; into {folder}",
+        f"{scenario}: {plan.seconds:.0f} s of mission at {speed:g} times real time, which takes {takes:.0f} s, and a "
+        f"few to begin and end; into {folder}",
         flush=True,
     )
     _fly(plan, folder, config, recording, endpoint, speed, stop)

@@ -125,7 +125,15 @@ def frame(view: View, look: Look, width: int, height: int = 0) -> list[Line]:
         first = max(0, min(marked - room // 2, len(body) - room))
         lines = [*head, *body[first : first + room]]
         lines = [*lines, *[[]] * (height - len(lines) - len(foot)), *foot][:height]
-    return [[(_clean(text), style) for text, style in line] for line in lines]
+    return [_cropped([(_clean(text), style) for text, style in line], width) for line in lines]
+
+
+def _cropped(line: Line, width: int) -> Line:
+    found: Line = []
+    for text, style in line:
+        found.append((text[:width], style))
+        width -= len(found[-1][0])
+    return found
 
 
 def plain(line: Line) -> str:
@@ -275,7 +283,7 @@ def _source(view: View, centre: str, row: Row, width: int) -> list[Line]:
     said = next(one.health.data["sources"][row.name] for one in view.centres if one.name == centre)
     lines: list[Line] = [
         [],
-        [(f"  {row.name}", "mark"), (f" of centre {centre}: {row.state}: {STATES[row.state]}", "head")],
+        *_wrapped("  ", f"{row.name} of centre {centre}: {row.state}: {STATES[row.state]}", width, "head", 0),
     ]
     for fault in row.faults:
         lines += _wrapped("! ", fault, width, "wrong", 0)

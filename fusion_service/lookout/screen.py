@@ -17,7 +17,7 @@ from fusion_service.lookout.view import View
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-__all__ = ["show"]
+__all__ = ["pressed", "show"]
 
 PERIOD = 1.0
 """Seconds between two views."""

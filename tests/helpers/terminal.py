@@ -19,7 +19,7 @@ STYLE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
 class Terminal:
-    """`fusion-service` with these words, in a terminal of so many columns and lines; killed at the end at the latest."""
+    """`fusion-service` with these words, in a terminal of so many columns and lines; killed at the end of `with`."""
 
     def __init__(self, *words: str, width: int = 100, height: int = 30, **environment: str) -> None:
         self._own, theirs = pty.openpty()
