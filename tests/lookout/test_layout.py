@@ -110,6 +110,9 @@ def test_keys_choose_sort_pause_and_open() -> None:
     assert pressed("enter", look, view()).alone
     assert not pressed("back", look._replace(alone=True), view()).alone
     assert pressed("back", look, view()).chosen is None
+    alone = pressed("enter", look, view())
+    assert pressed("page down", alone, view()).scroll == 10
+    assert pressed("up", alone, view()).scroll == 0
     assert pressed("s", Look(), view()).order == "name"
     assert pressed("p", Look(), view()).paused
     assert pressed("x", look, view()) == look
