@@ -65,7 +65,7 @@ def keyboard() -> Iterator[Keys]:
     try:
         descriptor = sys.stdin.fileno()
         before = termios.tcgetattr(descriptor)
-    except (OSError, ValueError, termios.error):  # no terminal
+    except (AttributeError, OSError, ValueError, termios.error):  # no terminal
         yield Keys(None)
         return
     changed = termios.tcgetattr(descriptor)
