@@ -32,7 +32,12 @@ def test_a_source_that_went_while_the_service_was_down_is_not_alive_after_its_re
 
 def test_whose_token_is_not_seen_for_a_while_is_gone(monkeypatch: pytest.MonkeyPatch) -> None:
     one = Tokens(lambda: None)
-    said = {"here": {"alive": True}, "away": {"alive": True}, "mute": {"alive": None}, "left": {"alive": False}}
+    said: dict[str, dict[str, bool | None]] = {
+        "here": {"alive": True},
+        "away": {"alive": True},
+        "mute": {"alive": None},
+        "left": {"alive": False},
+    }
     one.note("fusion/v1/local/here/alive", True)
     one.compare(said)
     assert one.changes() == {"here": True}
