@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import pytest
 
 import schemas
+from fusion_service.bus import Bus
 from fusion_service.lookout.ear import Ear
 from fusion_service.lookout.view import size_words, view_of
 from tests.lookout.test_layout import NOW, STATUS
@@ -61,3 +63,39 @@ def test_sizes_are_short() -> None:
     assert [size_words(one) for one in (0, 999, 1500, 123e6, 4.2e9, 5e15)] == [
         *("0 B", "999 B", "1.5 kB", "123 MB", "4.2 GB", "5000.0 TB"),
     ]
+
+
+class Listening:
+    """Stands for a bus on which one overhears."""
+
+    def __init__(self) -> None:
+        self.open = 0
+
+    def overhear(self, key: str, callback: Callable[[str, int], None]) -> Listening:
+        self.open += 1
+        self.say = callback
+        return self
+
+    def close(self) -> None:
+        self.open -= 1
+
+
+@pytest.mark.parametrize(("sizes", "pauses"), [([100] * 5, False), ([3 * 2**20], True), ([10] * 1200, True)])
+def test_where_much_is_overheard_one_pauses(sizes: list[int], pauses: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    ear, bus = Ear("fusion"), Listening()
+    ear.everywhere = True
+    ear.tend(cast(Bus, bus))
+    assert bus.open == 1
+    for k, size in enumerate(sizes):
+        bus.say(f"fusoin/v1/local/m{k}/tracks", size)
+    bus.say("fusion/v1/local/right/tracks", 10)
+    assert len(ear.beside()) == min(len(sizes), 500)
+    ear.tend(cast(Bus, bus))
+    assert bus.open == (0 if pauses else 1)
+    ear.tend(cast(Bus, bus))
+    assert bus.open == (0 if pauses else 1)
+    later = time.monotonic() + 60
+    monkeypatch.setattr("fusion_service.lookout.ear.time.monotonic", lambda: later)
+    assert ear.beside() == []
+    ear.tend(cast(Bus, bus))
+    assert bus.open == 1
