@@ -33,6 +33,7 @@ SECTIONS = {
             "tutorial",
             "operating",
             "troubles",
+            "top",
             "standby",
             "security",
             "arrival",

@@ -25,6 +25,7 @@ from fusion_service.commands import (
     rules,
     run,
     status,
+    top,
     verify,
 )
 
@@ -37,6 +38,7 @@ COMMANDS: dict[str, ModuleType] = {
         keys,
         run,
         status,
+        top,
         listen,
         order,
         record,
