@@ -25,6 +25,7 @@ STANDS_ON = {
     **{name: {*GROUND_FLOOR, "schemas", "fusion_service.densities"} for name in sorted(GROUND_FLOOR)},
     "fusion_service.densities": {*GROUND_FLOOR},
     "fusion_service.hints": {*GROUND_FLOOR, "schemas"},
+    "fusion_service.monitoring": {*GROUND_FLOOR, "schemas"},
     "fusion_service.rules": {*GROUND_FLOOR, "fusion_service.densities"},
     "fusion_service.bus": {*GROUND_FLOOR, "schemas"},
     "fusion_service.config": {*GROUND_FLOOR, "schemas", "fusion_service.rules", "fusion_service.bus.endpoint"},

@@ -57,5 +57,6 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         if args.metrics:
             bus.on_link(links.change)
         notify("READY=1\nSTATUS=routing")
-        stop.wait()
+        while not stop.wait(1.0):  # see `hangup`
+            pass
         notify("STOPPING=1")

@@ -75,6 +75,6 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         joined.append(bus)
         stack.callback(joined.clear)
         notify("READY=1")
-        while not stop.wait(5.0):
+        while not stop.wait(1.0):
             notify("WATCHDOG=1")
         notify("STOPPING=1")
