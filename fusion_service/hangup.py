@@ -4,8 +4,8 @@ A process that lasts heeds it from its first moment on; what it does then, a com
 terminal in which the process was started has been closed, nobody asks for a reload: it stops as by SIGTERM. One that
 was started with the signal ignored (nohup) outlives its terminal.
 
-A signal that comes while Python has just handled another, and goes back to wait, is noticed only when the wait ends: who
-waits for `stop` waits a second at a time.
+A signal that comes while Python has just handled another, and goes back to wait, is noticed only when the wait ends:
+who waits for `stop` waits a second at a time.
 """
 
 from __future__ import annotations

@@ -26,6 +26,8 @@ MOST = 8
 """Requests at a time."""
 PATIENCE = 10.0
 """Seconds that a request may take."""
+LOOK = 0.2
+"""Seconds between looks at those that take longer, and at whether to end."""
 
 log = logging.getLogger(__name__)
 
@@ -151,7 +153,7 @@ class _Server(ThreadingHTTPServer):
         return True
 
     def service_actions(self) -> None:
-        """End those that take too long; called twice a second at least."""
+        """End those that take too long; called every `LOOK` at least."""
         with self._lock:
             late = [one for one, since in self._open.items() if time.monotonic() - since > PATIENCE]
         for one in late:
@@ -175,7 +177,7 @@ def served(address: tuple[str, int], serving: Serving) -> Iterator[int]:
         server = _Server(address, serving)
     except OSError as error:
         raise OSError(f"metrics cannot be served on {host}:{port}: {error.strerror or error}") from None
-    thread = threading.Thread(target=server.serve_forever, name="metrics", daemon=True)
+    thread = threading.Thread(target=server.serve_forever, args=(LOOK,), name="metrics", daemon=True)
     thread.start()
     port = int(server.server_address[1])
     log.info("metrics on http://%s:%d/metrics, beside /healthz and /readyz", f"[{host}]" if ":" in host else host, port)
