@@ -25,7 +25,7 @@ from tests.helpers.processes import eventually, free_endpoint
 from tests.helpers.scene import COMMAND, SENSOR, Program
 
 ROOT = Path(__file__).parents[2]
-QUIET = ("Not trusted",)
+QUIET = ("Not trusted", "Refused")
 """Panels that are empty when all is well."""
 CENTRE = """
 [centre]
