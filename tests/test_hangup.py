@@ -82,10 +82,13 @@ class Terminal:
 
     def end(self) -> int:
         """Wait for it to end by itself; its exit code."""
-        status: list[int] = []
-        eventually(lambda: (found := os.waitpid(self.pid, os.WNOHANG))[0] and not status.append(found[1]))
+        eventually(self._ended)
         os.close(self.pipe)
-        return os.waitstatus_to_exitcode(status[0])
+        return os.waitstatus_to_exitcode(self._status)
+
+    def _ended(self) -> bool:
+        pid, self._status = os.waitpid(self.pid, os.WNOHANG)
+        return pid != 0
 
 
 def test_closing_the_terminal_ends_it_in_good_order() -> None:

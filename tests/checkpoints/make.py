@@ -28,7 +28,7 @@ def fly(centre: FusionCentre, seconds: range) -> list[StepResult]:
             if second == 1:
                 centre.handle(
                     SensorInfo(
-                        source=name, epoch=1, seq=0, sent=START, frame=FRAME, position=np.zeros(3), period=1.0,
+                        source=name, epoch=1, seq=0, sent=START, frame=FRAME, position=(0.0, 0.0, 0.0), period=1.0,
                         motion=Motion("cv", 1.0),
                     ),
                     START,

@@ -21,8 +21,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-from tests.helpers.processes import eventually, free_endpoint
-from tests.helpers.scene import COMMAND, SENSOR, Program
+from tests.helpers.processes import Program, eventually, free_endpoint
+from tests.helpers.scene import COMMAND, SENSOR
 
 ROOT = Path(__file__).parents[2]
 QUIET = ("Not trusted", "Refused")

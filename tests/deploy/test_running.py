@@ -11,7 +11,7 @@ import socket
 import subprocess
 import urllib.error
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -19,8 +19,8 @@ import pytest
 
 from fusion_service.monitoring import METRICS
 from tests.deploy.units import command
-from tests.helpers.processes import eventually, free_endpoint
-from tests.helpers.scene import SENSOR, Program
+from tests.helpers.processes import Program, eventually, free_endpoint
+from tests.helpers.scene import SENSOR
 
 CONFIG = """
 [centre]
@@ -57,6 +57,13 @@ class Unit:
                 self._told += self._socket.recv(4096).decode() + "\n"
             except BlockingIOError:
                 return self._told
+
+    def telling(self, words: str, times: int = 1) -> Callable[[], bool]:
+        """Whether the service manager was told this so often."""
+        return lambda: self.told().count(words) >= times
+
+    def is_ready(self) -> bool:
+        return self.get("/readyz") == (200, "ok\n")
 
     def log(self) -> str:
         return self._log.read_text("utf-8")
@@ -117,15 +124,15 @@ def units(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Unit]]
 
 def test_each_says_that_it_is_ready_and_alive(units: dict[str, Unit]) -> None:
     for name, unit in units.items():
-        eventually(lambda unit=unit: "READY=1" in unit.told(), 60)
+        eventually(unit.telling("READY=1"), 60)
         if name in ("centre", "recorder"):
-            eventually(lambda unit=unit: unit.told().count("WATCHDOG=1") >= 2)
+            eventually(unit.telling("WATCHDOG=1", 2))
             assert "STATUS=" in unit.told()
 
 
 def test_figures_and_health_are_served(units: dict[str, Unit]) -> None:
     for unit in units.values():
-        eventually(lambda unit=unit: unit.get("/readyz") == (200, "ok\n"), 60)
+        eventually(unit.is_ready, 60)
         assert unit.get("/healthz") == (200, "ok\n")
         assert unit.get("/nothing")[0] == 404
         figures = unit.figures()
@@ -162,7 +169,7 @@ def test_a_hangup_reloads_and_ends_none(units: dict[str, Unit], tmp_path: Path) 
     """After the figures were served: all have begun."""
     centre, recorder = units["centre"], units["recorder"]
     for unit in units.values():
-        eventually(lambda unit=unit: unit.get("/readyz")[0] == 200, 60)
+        eventually(unit.is_ready, 60)
         unit.process.send_signal(signal.SIGHUP)
     eventually(lambda: centre.says("reloaded: nothing has changed"))
     eventually(lambda: units["hub"].says("there is nothing to reload"))
