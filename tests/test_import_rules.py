@@ -280,3 +280,14 @@ def test_publisher_loads_neither_scipy_nor_rerun() -> None:
     loaded = set(run.stdout.split())
     assert {"schemas", "sensor_clients", "numpy"} <= loaded
     assert loaded & {"scipy", "rerun", "matplotlib", "pyarrow"} == set()
+
+
+def test_a_service_starts_without_what_takes_longest_to_import() -> None:
+    code = "import fusion_service.service.daemon, sys; print(*sys.modules)"
+    run = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
+    )
+    assert run.returncode == 0, run.stderr
+    loaded = set(run.stdout.split())
+    assert {"fusion_service.centre.centre", "scipy.special", "zenoh"} <= loaded
+    assert loaded & {"scipy.stats", "rerun", "matplotlib", "pyarrow", "numba"} == set()

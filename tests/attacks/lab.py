@@ -187,7 +187,7 @@ def lab(folder: Path, keys: Path | None) -> Iterator[Lab]:
     with ExitStack() as stack:
         one = Lab(folder, keys, stack)
         one.start()
-        eventually(lambda: one.report() and one.heard("fusion/v1/global/main/tracks", b"r1"), 15.0)
+        eventually(lambda: one.report() and one.heard("fusion/v1/global/main/tracks", b"r1"))
         yield one
 
 

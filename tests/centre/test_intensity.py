@@ -595,7 +595,7 @@ def mean_gospa(seed: int, names: Sequence[str], **config: Any) -> tuple[float, f
     return float(np.mean(distance)), float(np.mean(error)), float(np.mean(gap))
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [pytest.param(1, marks=pytest.mark.slow), 2])
 def test_three_radars_together_are_better_than_the_best_of_them(seed: int) -> None:
     names = list(world.RADARS)
     alone = [mean_gospa(seed, [name])[0] for name in names]

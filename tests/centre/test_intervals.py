@@ -190,7 +190,9 @@ def test_an_id_that_comes_back_after_it_is_forgotten_begins_anew() -> None:
     assert fed(step(made, 145 + 150)) == set()
 
 
-@pytest.mark.parametrize("cut", [150, 185, 300])
+@pytest.mark.parametrize(
+    "cut", [pytest.param(150, marks=pytest.mark.slow), 185, pytest.param(300, marks=pytest.mark.slow)]
+)
 def test_intervals_and_what_is_remembered_are_in_the_checkpoint(cut: int) -> None:
     made = centre((), lateness=5.0)
     made.handle(info("ais"), START)

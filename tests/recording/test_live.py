@@ -185,15 +185,15 @@ def test_the_command_serves_viewer_and_page_on_loopback_alone(hub: Hub, tmp_path
     with Program(run) as program:
         assert program.line(20) == f"live: rerun --connect rerun+http://127.0.0.1:{live}/proxy"
         page = program.line().removeprefix("live: ")
-        eventually(lambda: listeners(web), 10)
+        eventually(lambda: listeners(web))
         assert listeners(web) == listeners(live) == {"0100007F"}
         with urllib.request.urlopen(page, timeout=10) as answer:
             assert b"rerun" in answer.read().lower()
-        eventually((tmp_path / "a.rrd").exists, 10)
+        eventually((tmp_path / "a.rrd").exists)
         program.signal(end)
         code, _ = program.end()
         assert code == (0 if end == signal.SIGTERM else -end)
-        eventually(lambda: not listeners(web) | listeners(live), 10)
+        eventually(lambda: not listeners(web) | listeners(live))
     assert list(read(tmp_path / "a.rrd")) == []
 
 

@@ -38,9 +38,9 @@ def test_scans_are_stepped_as_they_come_and_a_reader_has_the_whole_picture(scene
         read = len(scene.seen.pictures)
         return 0 if newest is None else int((newest.status == CONFIRMED).sum())
 
-    eventually(lambda: confirmed() == 3, 15)
+    eventually(lambda: confirmed() == 3)
     begin = len(scene.seen.pictures)
-    eventually(lambda: len(scene.seen.pictures) > begin + 20, 10)
+    eventually(lambda: len(scene.seen.pictures) > begin + 20)
     some: list[GlobalTracks] = scene.seen.pictures[begin:]
     deltas = [one for one in some if one.delta]
     assert len(deltas) > 10

@@ -134,11 +134,11 @@ def test_three_centres_over_processes(centres: Centres) -> None:
     tree = "top" in centres.services
     if tree:
         eventually(lambda: centres.pictures["top"] and set(_in_all(centres.pictures["top"][-1])) >= {"sA", "sB"}, 20)
-        eventually(lambda: set(centres.counts().values()) == {TARGETS}, 10)
+        eventually(lambda: set(centres.counts().values()) == {TARGETS})
     else:
         eventually(centres.complete, 20)
     begin = {name: len(some) for name, some in centres.pictures.items()}
-    eventually(lambda: all(len(some) >= begin[name] + 20 for name, some in centres.pictures.items()), 10)
+    eventually(lambda: all(len(some) >= begin[name] + 20 for name, some in centres.pictures.items()))
     for name, some in centres.pictures.items():
         fresh = [picture for picture in some[begin[name] :] if len(picture.ids) == TARGETS]
         assert len(fresh) >= 10, (name, len(fresh), len(some) - begin[name])
@@ -151,4 +151,4 @@ def test_three_centres_over_processes(centres: Centres) -> None:
         assert program.running()
     for program in centres.sensors.values():
         program.kill()
-    eventually(lambda: set(centres.counts().values()) == {0}, 12)
+    eventually(lambda: set(centres.counts().values()) == {0})

@@ -233,11 +233,11 @@ def test_an_id_that_was_seen_once_is_kept_however_soon_the_service_is_killed(sce
     scene.sensor("r1", 0)
     service = scene.service(PATIENT)
     scene.sensor("r2", 1)
-    eventually(scene.seen.sees(0, 1), 15)
+    eventually(scene.seen.sees(0, 1))
     service.kill()
     ids, count = scene.seen.confirmed(), len(scene.seen.pictures)
     scene.service(PATIENT)
-    eventually(lambda: len(scene.seen.pictures) > count and len(scene.seen.confirmed()) == 2, 15)
+    eventually(lambda: len(scene.seen.pictures) > count and len(scene.seen.confirmed()) == 2)
     assert scene.seen.confirmed() == ids
     assert sorted(scene.seen.pictures[-1].ids.tolist()) == sorted(ids.values())
     born = scene.seen.born()  # the log of the last step before the kill may not have gone out

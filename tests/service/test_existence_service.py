@@ -41,7 +41,7 @@ def test_who_agrees_is_believed_and_the_exponential_mixture_loses(
             pictures = scene.seen.pictures
             return bool(pictures) and pictures[-1].contributor_counts.tolist() == [2]
 
-        eventually(both, 15)
+        eventually(both)
         count = len(scene.seen.pictures)
         eventually(lambda: len(scene.seen.pictures) > count + 5)
         assert all(low <= picture.existence[0] <= high for picture in scene.seen.pictures[count:])

@@ -135,8 +135,8 @@ def test_a_flood_is_cut_and_the_others_go_on(hub: Hub, tmp_path: Path) -> None:
         for seq in range(3000):
             now = time.time_ns()
             out.put(encode(replace(SCAN, source="flood", seq=seq, time=now, sent=now, epoch=START)))
-        eventually(lambda: scene.said_of("flood", "flow"), 10)
-        eventually(lambda: dropped(scene) == scene.said_of("flood", "flow"), 10)
+        eventually(lambda: scene.said_of("flood", "flow"))
+        eventually(lambda: dropped(scene) == scene.said_of("flood", "flow"))
         assert 1000 < dropped(scene) <= 2900
         assert scene.said_of("radar", "flow") is None
         assert "of flood (messages)" in (scene.last_status().notes or ("",))[-1]

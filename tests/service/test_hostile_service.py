@@ -22,7 +22,7 @@ def scene(hub: Hub, tmp_path: Path) -> Iterator[Scene]:
     with opened(hub, tmp_path) as made:
         made.service()
         made.sensor("r1", 0, 1)
-        eventually(made.seen.sees(0, 1), 15)
+        eventually(made.seen.sees(0, 1))
         yield made
 
 
@@ -107,7 +107,7 @@ def test_refusals_are_told_before_any_step(hub: Hub, tmp_path: Path) -> None:
     with opened(hub, tmp_path) as scene:
         scene.service(centre='clock = "message"')
         publisher = scene.bus.publisher(schemas.local_key("r1", "tracks"))
-        eventually(lambda: scene.seen.statuses, 15)
+        eventually(lambda: scene.seen.statuses)
         for _ in range(3):
             publisher.put(b"garbage")
         eventually(lambda: scene.last_status().refused == {"not-msgpack": 3})

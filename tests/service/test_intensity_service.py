@@ -47,7 +47,7 @@ def test_the_service_fuses_intensities_refuses_tracks_and_comes_back_after_kill_
         sensor = scene.start(SENSOR, scene.endpoint, name, reach, *targets)
         assert sensor.line() == "up"
     scene.sensor("r3", 7)
-    eventually(scene.seen.sees(0, 1, 2, 5), 15)
+    eventually(scene.seen.sees(0, 1, 2, 5))
     before = scene.seen.confirmed()
     eventually(lambda: scene.seen.feeders(before[1]) == {"r1", "r2"})
     assert scene.seen.feeders(before[5]) == {"r2"}
@@ -60,7 +60,7 @@ def test_the_service_fuses_intensities_refuses_tracks_and_comes_back_after_kill_
     service.kill()
     killed = len(scene.seen.pictures)
     service = scene.service('kind = "intensity"')
-    eventually(lambda: len(scene.seen.pictures) > killed and scene.seen.sees(0, 1, 2, 5)(), 15)
+    eventually(lambda: len(scene.seen.pictures) > killed and scene.seen.sees(0, 1, 2, 5)())
     assert scene.seen.confirmed() == before
     service.signal(signal.SIGTERM)
     assert service.end(timeout=5.0)[0] == 0
@@ -69,13 +69,13 @@ def test_the_service_fuses_intensities_refuses_tracks_and_comes_back_after_kill_
 def test_a_state_of_the_other_kind_is_set_aside(scene: Scene) -> None:
     scene.sensor("r3", 1)
     service = scene.service()
-    eventually(scene.seen.sees(1), 15)
+    eventually(scene.seen.sees(1))
     service.signal(signal.SIGTERM)
     assert service.end(timeout=5.0)[0] == 0
     sensor = scene.start(SENSOR, scene.endpoint, "r1", "9000", "2")
     assert sensor.line() == "up"
     service = scene.service('kind = "intensity"')
-    eventually(scene.seen.sees(2), 15)
+    eventually(scene.seen.sees(2))
     service.signal(signal.SIGTERM)
     code, text = service.end(timeout=5.0)
     assert code == 0

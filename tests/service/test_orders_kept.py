@@ -127,7 +127,7 @@ def heard(scene: Scene, numbers: Iterable[int]) -> list[dict[str, Any]]:
         found[:] = [e for log in list(scene.seen.logs) for e in log.events if e["kind"] == "order"]
         return set(numbers) <= {e["number"] for e in found}
 
-    eventually(all_there, 10)
+    eventually(all_there)
     return found
 
 

@@ -142,10 +142,10 @@ def test_a_service_that_is_behind_says_so_loses_and_doubles_nothing_and_recovers
     scene.start(SLOW, str(config), str(slow))
     for name in ("r1", "r2"):
         scene.sensor(name, 0, 1, 2)
-    eventually(lambda: scene.seen.sees(0, 1, 2)() and len(scene.seen.feeders(scene.seen.confirmed()[0])) == 2, 15)
+    eventually(lambda: scene.seen.sees(0, 1, 2)() and len(scene.seen.feeders(scene.seen.confirmed()[0])) == 2)
     before, first = scene.seen.confirmed(), len(scene.seen.pictures)
     slow.touch()
-    eventually(lambda: "overload" in scene.last_status().step_time and scene.last_status().queue["overtaken"] >= 4, 8)
+    eventually(lambda: "overload" in scene.last_status().step_time and scene.last_status().queue["overtaken"] >= 4)
     eventually(lambda: scene.last_status().dropped, 4)  # told by the next step
     status = scene.last_status()
     assert status.step_time["skipped"] > 0
@@ -155,7 +155,7 @@ def test_a_service_that_is_behind_says_so_loses_and_doubles_nothing_and_recovers
     time.sleep(1.0)
     slow.unlink()
     ended = time.monotonic()
-    eventually(lambda: "overload" not in scene.last_status().step_time and not scene.last_status().notes, 4)
+    eventually(lambda: "overload" not in scene.last_status().step_time and not scene.last_status().notes)
     at = next(at for at, one in reversed(scene.seen.statuses) if "overload" in one.step_time)
     assert at - ended < 2.0
     assert scene.seen.confirmed() == before

@@ -28,7 +28,7 @@ def scene(hub: Hub, tmp_path: Path) -> Iterator[Scene]:
 def test_a_killed_sensor_is_told_within_a_second_and_others_keep_its_targets(scene: Scene) -> None:
     scene.service()
     sensors = [scene.sensor("r1", 0, 1, 2), scene.sensor("r2", 1, 2, 3), scene.sensor("r3", 2, 3, 4)]
-    eventually(lambda: scene.seen.sees(0, 1, 2, 3, 4)() and len(scene.seen.feeders(scene.seen.confirmed()[2])) == 3, 15)
+    eventually(lambda: scene.seen.sees(0, 1, 2, 3, 4)() and len(scene.seen.feeders(scene.seen.confirmed()[2])) == 3)
     before = scene.seen.confirmed()
     sensors[1].kill()
     killed = time.monotonic()
@@ -44,12 +44,12 @@ def test_a_killed_sensor_is_told_within_a_second_and_others_keep_its_targets(sce
 def test_the_picture_comes_back_after_kill_9_with_the_same_ids(scene: Scene) -> None:
     sensors = [scene.sensor("r1", 0, 1, 2), scene.sensor("r2", 1, 2, 3)]
     service = scene.service()
-    eventually(scene.seen.sees(0, 1, 2, 3), 15)
+    eventually(scene.seen.sees(0, 1, 2, 3))
     before = scene.seen.confirmed()
     service.kill()
     killed = len(scene.seen.pictures)
     service = scene.service()
-    eventually(lambda: len(scene.seen.pictures) > killed and scene.seen.sees(0, 1, 2, 3)(), 15)
+    eventually(lambda: len(scene.seen.pictures) > killed and scene.seen.sees(0, 1, 2, 3)())
     assert scene.seen.confirmed() == before
     assert all(set(picture.ids.tolist()) <= set(before.values()) for picture in scene.seen.pictures[killed:])
     scene.sensor("r3", 7)
@@ -61,7 +61,7 @@ def test_the_picture_comes_back_after_kill_9_with_the_same_ids(scene: Scene) -> 
     assert service.end(timeout=5.0)[0] == 0
     scene.service()
     eventually(lambda: scene.seen.pictures[-1].epoch != scene.seen.pictures[killed].epoch)
-    eventually(scene.seen.sees(0, 1, 2, 3, 7), 15)
+    eventually(scene.seen.sees(0, 1, 2, 3, 7))
     assert {k: scene.seen.confirmed()[k] for k in before} == before
     for sensor in sensors:
         assert sensor.running()
@@ -71,7 +71,7 @@ def test_a_restarted_sensor_takes_over_nobodys_links(scene: Scene) -> None:
     scene.service()
     scene.sensor("r1", 0, 1, 2)
     second = scene.sensor("r2", 0, 1, 2)
-    eventually(lambda: scene.seen.sees(0, 1, 2)() and scene.seen.feeders(scene.seen.confirmed()[0]) == {"r1", "r2"}, 15)
+    eventually(lambda: scene.seen.sees(0, 1, 2)() and scene.seen.feeders(scene.seen.confirmed()[0]) == {"r1", "r2"})
     before = scene.seen.confirmed()
     second.kill()
     scene.sensor("r2", 0, 1, 2, order="reversed")
@@ -91,7 +91,7 @@ def test_a_restarted_sensor_takes_over_nobodys_links(scene: Scene) -> None:
 def test_what_cannot_be_read_is_refused_by_reason_and_the_rest_goes_on(scene: Scene) -> None:
     scene.service()
     scene.sensor("r1", 0, 1)
-    eventually(scene.seen.sees(0, 1), 15)
+    eventually(scene.seen.sees(0, 1))
     now = time.time_ns()
     good = schemas.LocalTracks(
         source="bad", epoch=now, seq=0, sent=now, time=now, complete=True, space=("x", "y", "vx", "vy"),
@@ -126,7 +126,7 @@ def test_what_cannot_be_read_is_refused_by_reason_and_the_rest_goes_on(scene: Sc
     for reason, payload in cases:
         publisher.put(payload)
         expected[reason] = expected.get(reason, 0) + (2 if reason in ("not-finite", "not-positive-definite") else 1)
-    eventually(lambda: scene.last_status().refused == expected, 8)
+    eventually(lambda: scene.last_status().refused == expected)
     publisher.put(changed(seq=10))
     publisher.put(changed(seq=10))
     eventually(lambda: scene.said_of("bad", "repeats") == 1)
@@ -142,7 +142,7 @@ def test_operators_can_ask_and_order(scene: Scene) -> None:
     scene.service()
     scene.sensor("r1", 0, 1)
     scene.sensor("r2", 0)
-    eventually(scene.seen.sees(0, 1), 15)
+    eventually(scene.seen.sees(0, 1))
     [(_, data)] = scene.bus.ask(schemas.global_key("centre", "picture"))
     picture = schemas.decode(data)
     assert isinstance(picture, GlobalTracks)
@@ -172,7 +172,7 @@ def test_by_message_time_it_steps_when_all_live_sources_have_passed(hub: Hub, tm
         for publisher in (one, two):
             publisher.info(frame=frame, position=(0, 0, 0), period=1.0, motion=schemas.Motion("cv", 1.0))
         scene.service(centre='clock = "message"\nname = "slow"')
-        eventually(lambda: len(scene.last_status().sources) == 2 if scene.seen.statuses else False, 15)
+        eventually(lambda: len(scene.last_status().sources) == 2 if scene.seen.statuses else False)
 
         def times() -> list[float]:
             return [(picture.time - start) / second for picture in scene.seen.pictures]
@@ -222,7 +222,7 @@ def test_a_step_that_fails_does_not_end_the_service(
         thread.start()
         try:
             scene.sensor("r1", 0, 1)
-            eventually(scene.seen.sees(0, 1), 15)
+            eventually(scene.seen.sees(0, 1))
             before = set(scene.seen.born())
             broken["checkpoint"] = True
             eventually(lambda: broken["steps"] >= 2)
@@ -283,7 +283,7 @@ def test_mistakes_are_one_line_that_says_how_to_mend_them(arguments: list[str], 
 
 def test_a_second_service_on_the_same_state_is_refused(scene: Scene) -> None:
     scene.service()
-    eventually(lambda: scene.seen.statuses, 15)
+    eventually(lambda: scene.seen.statuses)
     assert scene.last_status().road == "plain"
     code, errors = scene.service().end()
     assert code == 1

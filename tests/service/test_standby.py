@@ -92,7 +92,7 @@ def test_where_the_bus_splits_both_go_on_and_the_later_one_stays(tmp_path: Path,
     pair.sensor("r1", 0, 1, 2)
     pair.sensor("r2", 0, 1, 2, hub=1)
     pair.started(0, 1, 2)
-    eventually(lambda: far.sees(0, 1, 2), 10)
+    eventually(lambda: far.sees(0, 1, 2))
     before = near.pictures[-1].targets
     hubs.link.cut()
     eventually(lambda: near.status and any("stands by no more" in one for one in near.status.notes or ()))
@@ -101,12 +101,12 @@ def test_where_the_bus_splits_both_go_on_and_the_later_one_stays(tmp_path: Path,
     assert [term % 4 for term in terms] == [0, 1]
     pair.sensor("r3", 7, hub=0)
     pair.sensor("r4", 9, hub=1)
-    eventually(lambda: near.sees(0, 1, 2, 7), 10)
-    eventually(lambda: far.pictures and 9 in far.pictures[-1].targets, 10)
+    eventually(lambda: near.sees(0, 1, 2, 7))
+    eventually(lambda: far.pictures and 9 in far.pictures[-1].targets)
     assert near.pictures[-1].targets[7] != far.pictures[-1].targets[9]
     hubs.link.mend()
     eventually(lambda: far.ready(), 20)
-    eventually(lambda: near.sees(0, 1, 2, 7, 9) and far.sees(0, 1, 2, 7, 9), 10)
+    eventually(lambda: near.sees(0, 1, 2, 7, 9) and far.sees(0, 1, 2, 7, 9))
     assert max(terms) == terms[1]
     eventually(lambda: pair.active() == 1)
     assert near.pictures[-1].targets == far.pictures[-1].targets
@@ -132,7 +132,7 @@ def test_none_hands_over_to_nobody_and_all_to_one_of_other_settings(
     eventually(pair.watch.ready, 20)
     lonely.kill()
     lonely.__exit__()
-    eventually(lambda: not pair.watch.ready(), 5)
+    eventually(lambda: not pair.watch.ready())
     assert main(["order", "handover", "--connect", hub.endpoint]) == 1
     assert "no handover: nobody stands by with the newest state" in capsys.readouterr().err
     pair.centre(1, standby=True, more="gate = 0.98\n")  # an upgrade with other settings: it is copied, not followed

@@ -63,7 +63,7 @@ class Mission:
         elif what == "freeze":
             time.sleep(max(0.0, self._frozen - (time.monotonic() - begin)))
             program.signal(signal.SIGCONT)
-        eventually(lambda: self.pair.active() != which, 10)
+        eventually(lambda: self.pair.active() != which)
         return first.at - begin, first.at - last.at, changed
 
 

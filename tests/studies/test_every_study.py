@@ -16,8 +16,12 @@ STUDIES = catalogue()
 DATA = data_folder("autoferry")
 
 
-LONG = {"autoferry", "dubey-consensus", "li-nonlinear", "sharma-three-radars", "tracklets", "unequal-sensors"}
-"""Tens of seconds each, for they fly whole missions: `make slow-test`."""
+LONG = {
+    *("autoferry", "dubey-consensus", "li-nonlinear", "sharma-three-radars", "tracklets", "unequal-sensors"),
+    *("dubey-sonobuoys-ct", "dubey-sonobuoys-cv", "sharma-network-1", "sharma-network-2", "track-correlation"),
+    *("uney-bernoulli", "uney-iid-cluster"),
+}
+"""Ten seconds and more each, for they fly whole missions: `make slow-test`."""
 
 
 @pytest.mark.parametrize(
