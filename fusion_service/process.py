@@ -1,4 +1,4 @@
-"""What every process of ours does the same way: values of options, logs, signals in two stages, exit codes, and where
+"""What every process of ours does the same way: values of options, signals in two stages, exit codes, and where
 recorded data are looked for.
 
 Exit codes: 0 done, or stopped by a signal; 2 bad usage or config; 1 any other failure, told in one line.
@@ -16,12 +16,13 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, nullcontext, redirect_stdout
 from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn, TextIO, TypeVar, cast
 
 from fusion_service.escape import Escaped, escaped, into_nothing
+from fusion_service.hangup import heed
 
 __all__ = [
     "GRACE",
@@ -33,7 +34,6 @@ __all__ = [
     "loading",
     "positive",
     "reader_left",
-    "set_up_logging",
     "stop_on_signals",
     "whole",
 ]
@@ -47,38 +47,10 @@ GRACE = 4.0
 _LOADING = threading.Event()
 
 
-class _JsonFormatter(logging.Formatter):
-    def format(self, record: logging.LogRecord) -> str:
-        import json
-
-        entry = {"time": round(record.created, 3), "level": record.levelname.lower(), "logger": record.name}
-        entry["message"] = record.getMessage()
-        if record.exc_info:
-            entry["trace"] = self.formatException(record.exc_info)
-        return json.dumps(entry)
-
-
-class _TextFormatter(logging.Formatter):
-    """A message that holds new lines cannot look like several."""
-
-    def formatMessage(self, record: logging.LogRecord) -> str:
-        record.message = escaped(record.message).replace("\n", "\n    ")
-        return super().formatMessage(record)
-
-
-def set_up_logging(verbose: bool = False) -> None:
-    """Log to stderr: text, or JSON lines under a service manager (systemd sets JOURNAL_STREAM)."""
-    handler = logging.StreamHandler()
-    if os.environ.get("JOURNAL_STREAM"):
-        handler.setFormatter(_JsonFormatter())
-    else:
-        handler.setFormatter(_TextFormatter("%(asctime)s %(levelname)-7s %(message)s", "%H:%M:%S"))
-    logging.basicConfig(level=logging.DEBUG if verbose else logging.INFO, handlers=[handler], force=True)
-
-
 @contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
-    """An event that SIGINT or SIGTERM sets. A second signal, or `GRACE` seconds, end the process at once.
+def stop_on_signals(lasting: bool = False) -> Iterator[threading.Event]:
+    """An event that SIGINT or SIGTERM sets. A second signal, or `GRACE` seconds, end the process at once. lasting:
+    SIGHUP does not end it (see `hangup`).
 
     Both is left to the kernel, so that it also happens while a long call holds the interpreter; only the first
     signal needs Python to run once.
@@ -104,7 +76,8 @@ def stop_on_signals() -> Iterator[threading.Event]:
     for number in handled:
         signal.signal(number, on_signal)
     try:
-        yield stop
+        with heed(lambda: on_signal(signal.SIGHUP, None)) if lasting else nullcontext():
+            yield stop
     finally:
         left.set()
         if stop.is_set():

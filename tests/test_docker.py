@@ -95,7 +95,7 @@ def test_every_command_is_one_of_ours(name: str, environment: dict[str, str]) ->
 
 def test_the_whole_scenario_is_there() -> None:
     assert set(CLIENTS) == {*three_radars().sensors, "truth"}
-    assert set(SERVICES) - set(CLIENTS) == {"hub", "service", "record"}
+    assert set(SERVICES) - set(CLIENTS) == {"hub", "service", "record", "metrics"}
     assert all(arguments(name).scenario == "three-radars" for name in CLIENTS)
 
 
@@ -104,12 +104,32 @@ def test_all_join_the_hub_on_a_network_without_a_way_out() -> None:
     endpoint = f"tcp/hub:{listen.rpartition(':')[2]}"
     assert listen.startswith("tcp/0.0.0.0:")
     assert {arguments(name).connect for name in CLIENTS} == {endpoint}
-    assert arguments("record").connect == [endpoint]
+    assert arguments("record").connect == arguments("metrics").connect == [endpoint]
     assert load_config(DOCKER / "centre.toml").bus.connect == (endpoint,)
-    assert SERVICES["service"]["healthcheck"]["test"] == ["CMD", "centre-health", endpoint]
+    for name, one in SERVICES.items():
+        assert one.get("ports", []) == (["127.0.0.1:9467:9467"] if name == "metrics" else [])
+        assert one["networks"] == (["bus", "watch"] if name == "metrics" else ["bus"])
+    assert COMPOSE["networks"]["bus"]["internal"] is True
+
+
+def test_health_is_asked_where_it_is_served() -> None:
+    """Within the container, by HTTP: each session that asked over the bus would leave some KiB in the hub."""
+    for name in set(SERVICES) - set(CLIENTS):
+        options = arguments(name)
+        host, port = options.listen if name == "metrics" else options.metrics
+        *words, code = SERVICES[name]["healthcheck"]["test"]
+        assert words == ["CMD", "python", "-c"]
+        assert host == "0.0.0.0"
+        path = "readyz" if name in ("hub", "service") else "healthz"
+        assert f"http://127.0.0.1:{port}/{path}" in code
+        compile(code, name, "exec")
+
+
+def test_no_process_is_root_or_may_become_it() -> None:
+    uid = re.findall(r"^USER (\S+)$", (DOCKER / "Dockerfile").read_text(), re.MULTILINE)
     for one in SERVICES.values():
-        assert "ports" not in one
-        assert all(COMPOSE["networks"][network]["internal"] for network in one["networks"])
+        assert [one["user"]] == uid
+        assert (one["read_only"], one["cap_drop"], one["security_opt"]) == (True, ["ALL"], ["no-new-privileges:true"])
 
 
 def test_a_client_that_is_done_stays_away_and_the_rest_comes_back() -> None:

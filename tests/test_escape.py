@@ -52,7 +52,7 @@ def test_a_stream_is_otherwise_as_it_was() -> None:
 
 def test_a_log_line_cannot_forge_another() -> None:
     code = (
-        "import logging; from fusion_service.process import set_up_logging; set_up_logging();"
+        "import logging; from fusion_service.logs import set_up_logging; set_up_logging();"
         "logging.getLogger('x').warning('%s', 'one\\n12:00:00 INFO forged \\x1b[2J')"
     )
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, env={}).stderr

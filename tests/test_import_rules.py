@@ -16,19 +16,8 @@ GROUND_FLOOR = {
     f"fusion_service.{name}"
     for name in (
         *("linalg", "geodesy", "hulls", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
-        *(
-            "errors",
-            "arrays",
-            "order",
-            "records",
-            "turn",
-            "ways",
-            "source_words",
-            "layout",
-            "compiled",
-            "escape",
-            "extras",
-        ),
+        *("errors", "arrays", "order", "records", "turn", "ways", "source_words", "layout", "compiled", "escape"),
+        *("logs", "hangup", "extras"),
     )
 }
 STANDS_ON = {
@@ -36,6 +25,7 @@ STANDS_ON = {
     **{name: {*GROUND_FLOOR, "schemas", "fusion_service.densities"} for name in sorted(GROUND_FLOOR)},
     "fusion_service.densities": {*GROUND_FLOOR},
     "fusion_service.hints": {*GROUND_FLOOR, "schemas"},
+    "fusion_service.monitoring": {*GROUND_FLOOR, "schemas"},
     "fusion_service.rules": {*GROUND_FLOOR, "fusion_service.densities"},
     "fusion_service.bus": {*GROUND_FLOOR, "schemas"},
     "fusion_service.lookout": {*GROUND_FLOOR, "schemas", "fusion_service.bus", "fusion_service.hints"},

@@ -45,7 +45,10 @@ def test_all_that_the_project_asks_for_is_pinned() -> None:
     wanted = {*project["dependencies"], *(one for name, some in extras.items() if name != "oracle" for one in some)}
     names = {canonical(re.split(r"[\[<>=!~ ]", one)[0]) for one in wanted}
     assert names <= set(pins("constraints.txt"))
-    image = {*project["dependencies"], *(one for name in ("record", "report", "keys") for one in extras[name])}
+    image = {
+        *project["dependencies"],
+        *(one for name in ("record", "report", "keys", "metrics") for one in extras[name]),
+    }
     assert {canonical(re.split(r"[\[<>=!~ ]", one)[0]) for one in image} <= set(pins("docker/requirements.txt"))
 
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from fusion_service.bus.refusal import own_certificate
 from fusion_service.bus.roles import ANYONE, HELLO, allowed, hello_key
 from fusion_service.bus.security import HUB, Security, SecurityError, secured
-from fusion_service.bus.session import DEFAULT_ENDPOINT, open_bus, tell_refusals
+from fusion_service.bus.session import DEFAULT_ENDPOINT, Bus, open_bus, tell_refusals
 
 __all__ = ["open_hub", "run_hub"]
 
@@ -41,8 +41,8 @@ def run_hub(
 
 
 @contextmanager
-def open_hub(listen: Sequence[str], security: Security | None = None) -> Iterator[None]:
-    """A hub as a context manager. Raises as `run_hub`."""
+def open_hub(listen: Sequence[str], security: Security | None = None) -> Iterator[Bus]:
+    """A hub as a context manager; yields its own session. Raises as `run_hub`."""
     if security is not None and security.role != HUB:
         raise SecurityError(f'{security.path}: it is the file of a {security.role}: a hub needs one with role = "hub"')
     if security is not None:
@@ -63,7 +63,7 @@ def open_hub(listen: Sequence[str], security: Security | None = None) -> Iterato
             count = len(security.parties)
             log.info("only %d parties of %s are let in, each in its role", count, security.path)
         log.info("the hub listens on %s", ", ".join(listen))
-        yield
+        yield bus
 
 
 class _Door:

@@ -72,7 +72,8 @@ class FusionCentre(Centre):
             self._blobs.restore(state["blobs"])
         if "memory" in state:
             self._memory.restore(state["memory"])
-        self._supervisor.restore(state.get("supervision", {}))
+        learned = state.get("supervision", {})
+        self._supervisor.restore(learned if "look" in learned else {})  # of before 0.6.0: sources are learned anew
         if "suspended" in state:
             self._suspended = Suspended.unpacked(state["suspended"], len(self.config.space))
         self._note_waiting()

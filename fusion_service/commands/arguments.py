@@ -7,7 +7,7 @@ import math
 import re
 from datetime import UTC, datetime
 
-__all__ = ["duration", "moment", "port", "size"]
+__all__ = ["address", "duration", "moment", "port", "size"]
 
 SIZES = {"b": 1} | {
     f"{prefix}{suffix}": base**power
@@ -50,6 +50,17 @@ def port(text: str) -> int:
     if not (text.isascii() and text.isdigit() and 0 < int(text) < 65536):
         raise ValueError(f"{text!r} is not a port")
     return int(text)
+
+
+def address(text: str, port: int) -> tuple[str, int]:
+    """Host and port of HOST:PORT, HOST, PORT or [IPV6]:PORT; `port` where none is said. Raises ValueError in one
+    line."""
+    host, _, number = ("", "", text) if text.isascii() and text.isdigit() else text.rpartition(":")
+    if (not host and not (text.isascii() and text.isdigit())) or text.endswith("]"):
+        host, number = text, str(port)
+    if not (number.isascii() and number.isdigit() and int(number) < 65536) or not text:
+        raise ValueError(f"{text!r} is not HOST:PORT, HOST or PORT")
+    return host.strip("[]") or "127.0.0.1", int(number)
 
 
 def _value(text: str, units: dict[str, float] | dict[str, int], what: str) -> float:

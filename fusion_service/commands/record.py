@@ -13,10 +13,13 @@ from typing import TYPE_CHECKING
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
 from fusion_service.bus.options import bus_options
 from fusion_service.commands.arguments import duration, port, size
+from fusion_service.commands.observed import add_metrics, observed
+from fusion_service.hangup import on_hangup
 from fusion_service.process import argument
 
 if TYPE_CHECKING:
     from fusion_service.bus.security import Security
+    from fusion_service.recording import Recorder
     from fusion_service.recording.signing import Signer
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
@@ -28,7 +31,8 @@ EXAMPLE = """fusion-service record --out mission.rrd
   fusion-service record --out mission/ --rotate-every 1h --keep-for 7d     parts 0001.rrd, 0002.rrd, ...
   fusion-service record --out mission.rrd --sign rec.key                   signed: `verify` and others check it
   fusion-service record --live       look on with: rerun --connect rerun+http://127.0.0.1:9876/proxy
-  fusion-service record --live-web   look on in a browser"""
+  fusion-service record --live-web   look on in a browser
+SIGHUP begins the next part."""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -57,6 +61,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--sign", metavar="KEY", help="sign the recording by this private key, PEM, without a certificate"
     )
     parser.add_argument("--no-draw", action="store_true", help="record the messages alone, without the picture")
+    add_metrics(parser, "recorder")
     weeks = parser.add_argument_group("for weeks", "any of these makes the recording a folder of parts")
     for name, kind, metavar, text in (
         ("--rotate-size", size, "SIZE", "of a part (default 500MB)"),
@@ -115,6 +120,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.recording.live import DEFAULT_ADDRESS, Live
     from fusion_service.recording.parts import is_folder
     from fusion_service.recording.presence import Presence, host_name
+    from fusion_service.service.notify import listening, notify
     from schemas import check_name
 
     limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
@@ -141,7 +147,18 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             live = Live(*(args.live or DEFAULT_ADDRESS), web=args.live_web)
             stack.callback(live.close)
             print(f"live: rerun --connect {live.url}" + (f"\nlive: {live.page}" if live.page else ""), flush=True)
+        attended = _Attended()
+        stack.enter_context(on_hangup(attended.next_part))
+        stack.enter_context(listening(attended.pulse.told))
+        pulse, figures = attended.pulse, attended.figures
+        stack.enter_context(observed(args.metrics, "recorder", figures.samples, pulse.alive, pulse.begun))
         bus = stack.enter_context(open_bus(args.connect or [DEFAULT_ENDPOINT], stop=stop, security=security))
+        presence = Presence(bus, name, path, args.realm)
+
+        def tick(recorder: Recorder) -> None:
+            presence.note(recorder)
+            attended.tick(recorder)
+
         run_recorder(
             bus,
             path,
@@ -153,8 +170,9 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             signer=signer,
             live=live,
             interval=args.flush,
-            on_tick=Presence(bus, name, path, args.realm).note,
+            on_tick=tick,
         )
+        notify("STOPPING=1")
 
 
 def _check_place(path: Path, *, folder: bool, make: bool) -> None:
@@ -178,3 +196,31 @@ def _check_place(path: Path, *, folder: bool, make: bool) -> None:
         why = os.strerror(error.errno or 0)
         raise PermissionError(f"{place} cannot be written ({why}): name another place with --out, or mend it") from None
     import_rerun()
+
+
+class _Attended:
+    """Tells those who look after the recorder how it is, and it that a part is to end."""
+
+    def __init__(self) -> None:
+        from fusion_service.monitoring import Pulse, Recorded
+
+        self.pulse, self.figures = Pulse(), Recorded()
+        self._recorder: Recorder | None = None
+
+    def tick(self, recorder: Recorder) -> None:
+        """On the recorder's thread."""
+        from fusion_service.monitoring import recorder_samples
+        from fusion_service.service.notify import notify
+
+        words = f"STATUS={recorder.messages} messages, {recorder.bytes} bytes, in {recorder.path.name}"
+        notify(f"{'' if self._recorder else 'READY=1'}\nWATCHDOG=1\n{words}".strip())
+        self._recorder = recorder
+        counts = recorder.messages, recorder.bytes, recorder.rows, dict(recorder.undecodable), dict(recorder.undrawn)
+        self.figures.tick(recorder_samples(*counts), recorder.path)
+
+    def next_part(self) -> None:
+        """Of a recording in parts, at the next tick."""
+        if self._recorder is None:
+            log.info("nothing is recorded yet: there is no part to end")
+        elif not self._recorder.next_part():
+            log.warning("it goes on in one file: record into a folder (--out mission/) for parts that a signal ends")

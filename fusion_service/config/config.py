@@ -321,6 +321,7 @@ class DaemonConfig:
 
     state: str | None = _setting(None, maybe(text), "folder for ids and checkpoint; left out: ids by clock, no memory")
     status_period: float = _setting(1.0, number(0.1, 3600), "seconds between status messages")
+    log_level: str = _setting("info", choice("debug", "info", "warning", "error"), "what is logged; -v goes before it")
     log_refusals: float = _setting(1.0, number(0.0, 1000), "log lines about refusals per second and reason at most")
     takeover: float = _setting(
         1.0, number(0.2, 60), "seconds without a sign of the active centre after which one that stands by takes over"

@@ -125,6 +125,11 @@ class Folder:
             os.close(self._lock)
             raise OSError(f"{path} is being recorded into by another process: name another folder") from None
         self._began = 0.0
+        self._asked = False
+
+    def ask(self) -> None:
+        """The part that is being written is to end. On any thread."""
+        self._asked = True
 
     def close(self) -> None:
         """Let others record into it."""
@@ -133,12 +138,14 @@ class Folder:
     def next(self) -> Path:
         """The part that follows all there are."""
         last = max((number_of(path) or 0 for path in parts(self.path)), default=0)
-        self._began = time.monotonic()
+        self._began, self._asked = time.monotonic(), False
         return self.path / f"{last + 1:04d}.rrd"
 
     def full(self, current: Path) -> bool:
         """Whether the part that is being written is to end."""
         rotation = self._rotation
+        if self._asked:
+            return True
         if rotation.every is not None and time.monotonic() - self._began >= rotation.every:
             return True
         return rotation.limit is not None and current.stat().st_size >= rotation.limit

@@ -190,6 +190,13 @@ class Recorder:
         self.missing += count
         self._say(f"{count} messages on {key} were lost", received)
 
+    def next_part(self) -> bool:
+        """Begin the next part at the next `tick` with a message in this one; whether the recording is in parts. On any
+        thread."""
+        if self._folder is not None:
+            self._folder.ask()
+        return self._folder is not None
+
     def tick(self) -> None:
         """Hand what came since the last tick to the operating system, and every few seconds what was drawn; end a
         part that is full. `OSError` if that cannot be written, or the disk is all but full."""

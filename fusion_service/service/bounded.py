@@ -21,9 +21,13 @@ class BoundedLog:
     """Counts when what was last said. refusals: lines about refusals per second and reason at most."""
 
     def __init__(self, refusals: float) -> None:
-        self._interval = 1.0 / max(refusals, 1e-3)
+        self.limit(refusals)
         self._told: dict[str, float] = {}
         self._refused: dict[str, tuple[float, int]] = {}
+
+    def limit(self, refusals: float) -> None:
+        """As many lines from now on."""
+        self._interval = 1.0 / max(refusals, 1e-3)
 
     def allows(self, what: str, interval: float) -> bool:
         """Whether `interval` seconds have passed since this was last allowed."""
@@ -54,4 +58,4 @@ class BoundedLog:
             since, told = self._refused.get(reason, (float("-inf"), 0))
             if total > told and now - since >= self._interval:
                 self._refused[reason] = (now, total)
-                log.warning("refused %d more: %s (%d in all)", total - told, reason, total)
+                log.warning("refused %d more: %s (%d in all)", total - told, reason, total, extra={"reason": reason})

@@ -40,8 +40,9 @@ from fusion_service.service.notify import notify
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.overload import Overload, overtaken
 from fusion_service.service.promises import Reply
+from fusion_service.service.reloading import Reloads, Tuned
 from fusion_service.service.state import State, open_state
-from fusion_service.service.status import StatusMaker, start_line, status_line
+from fusion_service.service.status import StatusMaker, start_line, tell_status
 from fusion_service.service.stepping import LastingCentre
 from fusion_service.service.succession import Process, succeed
 from fusion_service.service.tenure import Tenure
@@ -83,9 +84,11 @@ class Arrival(NamedTuple):
     received: int
 
 
-def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = False) -> None:
-    """Run until `stop` is set; standby: begin as one that stands by. Raises `BusError`, `SecurityError`, `StateError`
-    or `ConfigError`, which says in one line why it cannot start."""
+def run_service(
+    config: ServiceConfig, stop: threading.Event, standby: bool = False, reloads: Reloads | None = None
+) -> None:
+    """Run until `stop` is set; standby: begin as one that stands by; reloads: tunes it. Raises `BusError`,
+    `SecurityError`, `StateError` or `ConfigError`, which says in one line why it cannot start."""
     try:
         loading()(begin)(config.service.compiled, stop, lambda road: log.info("small matrices by the road: %s", road))
     except ValueError as error:
@@ -95,7 +98,8 @@ def run_service(config: ServiceConfig, stop: threading.Event, standby: bool = Fa
         check_party(security, ("centre",), config.centre.name)
     log.info("%s", start_line(config))
     with open_state(config.service.state) as state:
-        succeed(Process(config, state, stop, security, Service), standby)
+        make = reloads.making(Service) if reloads else Service
+        succeed(Process(config, state, stop, security, make), standby)
 
 
 class Service:
@@ -128,6 +132,7 @@ class Service:
         self._refused: dict[str, int] = {}
         self._saying = threading.Lock()
         self._heart = Heartbeat(config.service.status_period, self._say_late)
+        self.tuned = Tuned(self._flow, self._told, self._heart)
 
     def feed(self, source: str, key: str, data: bytes, received: int) -> None:
         """Take a sample as if it came now: of one that stood by."""
@@ -179,8 +184,8 @@ class Service:
         self._stepped = not stop.is_set() and self._step_due()
         self._lasting.save()
         if (changed and self._told.allows("status", 0.1)) or time.monotonic() >= self._status_due:
-            self._status_due = time.monotonic() + self._config.service.status_period
-            notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
+            self._status_due = time.monotonic() + self._heart.period
+            tell_status(self._publish_status())
 
     def _declare(self) -> None:
         realm, name, bus = self._config.bus.realm, self._config.centre.name, self._bus
@@ -280,7 +285,7 @@ class Service:
             self._times.presence(name, alive)
         for name, alive in changed.items():
             if self._told.allows(f"tokens {self._counts['tokens'] % 20}", 1.0):  # twenty lines a second
-                log.info("source %s is %s", name, "there" if alive else "gone")
+                log.info("source %s is %s", name, "there" if alive else "gone", extra={"source": name})
                 self._counts["tokens"] += 1
             elif self._told.allows("many tokens", 1.0):
                 log.info("many sources come and go: %d there", sum(self._tokens.told.values()))
@@ -349,7 +354,8 @@ class Service:
                 continue
             bad, text = said
             if self._told.allows(f"sources {self._counts['sources'] % 20}", 1.0):
-                log.log(logging.WARNING if bad else logging.INFO, "source %s: %s", event.get("source"), text)
+                name = str(event.get("source"))
+                log.log(logging.WARNING if bad else logging.INFO, "source %s: %s", name, text, extra={"source": name})
                 self._counts["sources"] += 1
             elif self._told.allows("many sources", 1.0):
                 log.warning("much has changed about many sources: the status has it all")
@@ -389,8 +395,6 @@ class Service:
     def _say_late(self, busy: float, alive: bool) -> None:
         """On the heartbeat's thread: the loop is late with the status."""
         try:
-            status = self._say_status(busy)
-            if alive:
-                notify(f"WATCHDOG=1\nSTATUS={status_line(status)}")
+            tell_status(self._say_status(busy), alive)
         except Exception:
             self._told.error("no status could be published in place of the loop, at one thing for %.0f s", busy)

@@ -68,6 +68,11 @@ class Flow:
         self.why: dict[str, str] = {}
         """Which limit each of them went beyond last."""
 
+    def limit(self, config: LimitsConfig) -> None:
+        """Go on by these limits. Accounts begin anew, full."""
+        with self._lock:
+            self._config, self._accounts = config, {}
+
     def takes(self, source: str, size: int) -> bool:
         """Whether a message of so many bytes is taken now."""
         with self._lock:

@@ -25,7 +25,7 @@ class Heartbeat:
     manager. seconds: for which the loop has been at one thing; alive: whether it may still be taken for alive."""
 
     def __init__(self, period: float, late: Callable[[float, bool], None]) -> None:
-        self._period = period
+        self.period = period
         self._late = late
         self._done = threading.Event()
         self._begun = self._beaten = time.monotonic()
@@ -50,8 +50,8 @@ class Heartbeat:
         self._beaten = time.monotonic()
 
     def _watch(self) -> None:
-        while not self._done.wait(max(self._beaten + self._period + GRACE - time.monotonic(), 0.01)):
+        while not self._done.wait(max(self._beaten + self.period + GRACE - time.monotonic(), 0.01)):
             now = time.monotonic()
-            if now - self._beaten >= self._period + GRACE:
+            if now - self._beaten >= self.period + GRACE:
                 self._late(now - self._begun, now - self._begun < STUCK)
                 self._beaten = now

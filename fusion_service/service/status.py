@@ -12,11 +12,12 @@ from fusion_service import __version__
 from fusion_service.bus import Inbox
 from fusion_service.compiled import road
 from fusion_service.config import ServiceConfig
+from fusion_service.service.notify import notify
 from fusion_service.source_words import state_of
 from fusion_service.ways import reason_words
 from schemas import Status
 
-__all__ = ["StatusMaker", "start_line", "status_line"]
+__all__ = ["StatusMaker", "start_line", "status_line", "tell_status"]
 
 SAME_CLOCK = 3600.0
 """Seconds: pictures that are older when they go out are of a mission with a clock of its own."""
@@ -143,6 +144,12 @@ def start_line(config: ServiceConfig) -> str:
     hub, folder = ", ".join(config.bus.connect), config.service.state or "no folder"
     centre = f"centre {config.centre.name} of realm {config.bus.realm}"
     return f"fusion-service {__version__}: {centre}, hub {hub}, state in {folder}"
+
+
+def tell_status(status: Status, alive: bool = True) -> None:
+    """Tell who looks after the process of a status that was published; alive: its loop is, and the watchdog is
+    served."""
+    notify("WATCHDOG=1\n" * alive + f"STATUS={status_line(status)}", status)
 
 
 def status_line(status: Status) -> str:

@@ -9,7 +9,15 @@ from pathlib import Path
 __all__ = ["ROOT", "Block", "blocks", "pages"]
 
 ROOT = Path(__file__).parents[2]
-ELSEWHERE = ("README.md", "CONTRIBUTING.md", "CHANGELOG.md", "SECURITY.md", "docker/README.md", "schemas/WIRE.md")
+ELSEWHERE = (
+    "README.md",
+    "CONTRIBUTING.md",
+    "CHANGELOG.md",
+    "SECURITY.md",
+    "docker/README.md",
+    "deploy/README.md",
+    "schemas/WIRE.md",
+)
 FENCE = re.compile(r"(?:^<!-- (needs|not run): (.+?) -->\n)?^```([\w-]*)\n(.*?)^```$", re.M | re.S)
 
 

@@ -45,6 +45,7 @@ NO_CODE = ("", "text", "mermaid")
 COMMANDS = ("fusion-service", "sensor-client", "python", "make", "docker")
 NOT_RUN = {
     "docker/README.md": [*["needs a container engine"] * 4, "is Compose's"],
+    "deploy/README.md": ["needs a container engine"],
     "docs/security.md": ["it needs the certificates", "it is the file of a hub", "it sets a variable"],
 }
 """All blocks that are not run, with the beginning of the reason that the page gives."""
