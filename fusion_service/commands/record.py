@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
 from fusion_service.commands.arguments import duration, port, size
-from fusion_service.process import argument
+from fusion_service.process import argument, positive
 
 if TYPE_CHECKING:
     from fusion_service.bus.security import Security
@@ -49,7 +49,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="FILE",
         help="the recorder's certificate, which signs the recording too (see `fusion-service keys`)",
     )
-    parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
+    parser.add_argument(
+        "--cutoff",
+        type=argument(positive),
+        metavar="M",
+        help="largest error that still counts as followed, m: of the picture, and kept for `evaluate`",
+    )
+    parser.add_argument(
+        "--every", type=argument(positive), metavar="S", help="how often `evaluate` is to score, s: kept for it"
+    )
     parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
     parser.add_argument(
         "--flush",
@@ -148,6 +156,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             realm=args.realm,
             stop=stop,
             cutoff=args.cutoff,
+            every=args.every,
             draw=not args.no_draw,
             rotation=rotation,
             signer=signer,

@@ -132,7 +132,7 @@ def _fly(
         bus.watch(local_key("*", "alive"), watch.on_token)
         bus.subscribe(global_key("*", "tracks"), watch.on_tracks)
         crew.start("service", ["fusion_service", "run", "--config", str(config)])
-        crew.start("record", record_arguments(recording, endpoint, plan.cutoff))
+        crew.start("record", record_arguments(recording, endpoint, plan.cutoff, plan.every))
         token = global_key(load_config(config).centre.name, "alive")
         _wait(lambda: recording.exists() and token in watch.tokens, crew, stop)
         begin = time.time() + START

@@ -34,6 +34,7 @@ from fusion_service.recording.drawing.scene import MAX_SOURCES, PATIENCE, Scene
 from fusion_service.recording.parts import Folder, Rotation, begin, is_folder, number_of, parts
 from fusion_service.recording.reader import recording_id
 from fusion_service.recording.repair import mend
+from fusion_service.recording.scoring import Scoring, write_scoring
 from fusion_service.recording.sealing import Sealer, last_link
 from schemas import REALM, Frame, Message, MessageError, SensorInfo, check_realm, decode, parse_key
 
@@ -69,6 +70,7 @@ class Recorder:
     with /), or any name with `rotation`; parts that are there stay, and are gone on from. `OSError` if it cannot be
     made. frame: draw in this frame; None takes that of the first global tracks, or of the first other message if none
     come in the first seconds. cutoff: of the assignment of tracks to true objects, m; None chooses one for each step.
+    every: s between scored times. Both are kept in the recording, for `evaluate`.
     trail: seconds of each trail that are seen at first. draw: False records the messages alone. focus: the id of a
     global track; the recording opens on this one alone, with its series. live: shown the same picture; closed with
     the recorder. signer: signs the chain of hashes.
@@ -81,6 +83,7 @@ class Recorder:
         realm: str = REALM,
         frame: Frame | None = None,
         cutoff: float | None = None,
+        every: float | None = None,
         trail: float = 300.0,
         draw: bool = True,
         rotation: Rotation | None = None,
@@ -94,6 +97,7 @@ class Recorder:
         self.messages = 0
         self.bytes = 0
         self.undecodable: Counter[str] = Counter()
+        self._scoring = Scoring(cutoff, every)
         self._prefix = f"{check_realm(realm)}/v1/"
         self._trail = trail
         self._draw = draw
@@ -259,6 +263,7 @@ class Recorder:
         stream.send_recording_name(self.path.stem if self._folder is None else self.path.parent.name)
         part = (number_of(self.path) or 0) if self._folder is not None else 0
         stream.send_property("part", rr.AnyValues(number=number_of(self.path) or 0, begins=begins))
+        write_scoring(stream, self._scoring)
         self._stream = stream
         self._sealer.begin(stream, self._id, part)
 

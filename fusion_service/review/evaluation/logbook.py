@@ -17,14 +17,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.geodesy import FrameError, transform
+from fusion_service.recording.drawing.labels import Labels
 from fusion_service.review.evaluation.account import Account
 from fusion_service.review.evaluation.latency import Delays, Latency
+from fusion_service.review.evaluation.misses import PlatformPath
 from fusion_service.review.evaluation.traffic import Traffic
 from fusion_service.review.snapshots import Times, TrackMessage
 from schemas import (
     UNKNOWN_SIGMA,
     Frame,
     GlobalTracks,
+    Local,
     LocalIntensity,
     LocalTracks,
     Message,
@@ -39,6 +42,8 @@ from schemas import (
 __all__ = ["Logbook"]
 
 
+NO_FRAME = Local("none")
+"""Of a centre's pictures before it knows a frame."""
 SHOWING_EVERY = 8
 """Messages between calls of `progress`."""
 
@@ -48,7 +53,7 @@ class Logbook:
 
     truths; infos: newest of each source; accounts: by centre; traffic: by ("local", "intensity" or "global", name);
     latency: by (kind, name); bad: messages that do not decode, by reason; counts: messages by type; flat: centres
-    with a track whose height nobody told.
+    with a track whose height nobody told; labels: of global tracks, as recordings show them; platforms: by source.
     """
 
     def __init__(self, messages: Iterable[Message] = ()) -> None:
@@ -62,6 +67,8 @@ class Logbook:
         self.origins: Counter[str] = Counter()
         self.first_pictures: dict[str, GlobalTracks] = {}
         self.flat: set[str] = set()
+        self.labels = Labels()
+        self.platforms: dict[str, PlatformPath] = {}
         self.received: tuple[int, int] | None = None
         self.path: Path | None = None
         self._spaces: dict[str, set[tuple[tuple[str, ...], Frame]]] = {}
@@ -227,13 +234,18 @@ class Logbook:
             self._spreads[kind].append(typical)
         if isinstance(message, GlobalTracks):
             self._account(name).picture(message)
+            self.labels.see(message)
             if not told.all():
                 self.flat.add(name)
             first = self.first_pictures.setdefault(name, message)
-            if (message.time, message.epoch) < (first.time, first.epoch):
+            if _first(message) < _first(first):
                 self.first_pictures[name] = message
         else:
             self._spaces.setdefault(name, set()).add((message.space, message.frame))
+            if message.platform is not None:
+                path = self.platforms.setdefault(name, PlatformPath([], []))
+                path.times.append(message.time)
+                path.places.append((message.platform, message.frame))
 
     def _account(self, centre: str) -> Account:
         return self.accounts.setdefault(centre, Account())
@@ -247,5 +259,13 @@ class Logbook:
             period = info.period if info else None
             time, epoch, seq = (columns[one][mine] for one in ("time", "epoch", "seq"))
             self.traffic[kind, name].count(time, epoch, seq, period)
+        for name, path in self.platforms.items():
+            order = sorted(range(len(path.times)), key=path.times.__getitem__)
+            self.platforms[name] = PlatformPath([path.times[k] for k in order], [path.places[k] for k in order])
         self.latency = self._delays.result()
         self._delays = Delays()
+
+
+def _first(picture: GlobalTracks) -> tuple[bool, int, int]:
+    """Sorting key of pictures, those that name no frame last: what a centre says before it knows one."""
+    return picture.frame == NO_FRAME and not len(picture.ids), picture.time, picture.epoch

@@ -22,6 +22,7 @@ from fusion_service.review.evaluation.tables import (
     tracking_table,
     truthless_lines,
 )
+from fusion_service.review.evaluation.target_words import target_lines
 from fusion_service.source_words import biases, consistency, state_of
 
 __all__ = ["facts", "label", "results", "rows_of", "rule_of", "text"]
@@ -74,7 +75,7 @@ def facts(assessment: Assessment) -> dict[str, str]:
     if book.bad:
         found["not read"] = ", ".join(f"{count} messages: {reason}" for reason, count in sorted(book.bad.items()))
     chosen = " (chosen: about 10 times the typical standard deviation)" if assessment.chosen else ""
-    found["cut-off"] = f"{assessment.c:g} m{chosen}"
+    found["cut-off"] = f"{assessment.c:g} m{chosen or (' (kept in the recording)' if assessment.kept else '')}"
     return found
 
 
@@ -88,7 +89,7 @@ def text(assessments: Sequence[Assessment]) -> str:
         lines += ["", *aligned(rules_table(rows), left=len(rules_table(rows)[0]) - NUMBERS)]
     for one in assessments:
         centre = next(iter(one.evaluations), next(iter(one.agreements), ""))
-        lines += ["", f"{one.book.path or 'mission'}" + (f", cut-off {facts(one)['cut-off']}" if one.chosen else "")]
+        lines += ["", f"{one.book.path or 'mission'}" + (f", cut-off {facts(one)['cut-off']}" if one.chosen or one.kept else "")]
         if one.book.bad:
             lines.append(f"not read: {facts(one)['not read']}")
         if one.evaluations:
@@ -98,7 +99,8 @@ def text(assessments: Sequence[Assessment]) -> str:
             scored = {**evaluation.sources, **({"fused": evaluation.fused} if evaluation.centre else {})}
             lines += [format_table(evaluation), ""]
             lines += [*hull, ""] if (hull := hull_lines(scored)) else []
-            lines += [*aligned(tracking_table(scored, len(evaluation.targets))), confirm_line(evaluation)]
+            lines += [*aligned(tracking_table(scored, len(evaluation.targets))), confirm_line(evaluation), ""]
+            lines += target_lines(evaluation, int(evaluation.times[0]), one.book.labels)
         lines += ["", *truthless_lines(one, centre)]
     return "\n".join(line for k, line in enumerate(lines) if line or k == 0 or lines[k - 1])
 
@@ -125,6 +127,7 @@ def _recording(one: Assessment) -> dict[str, Any]:
         "unscored": one.unscored,
         "cutoff": one.c,
         "cutoff_chosen": one.chosen,
+        "cutoff_kept": one.kept,
         "traffic": {
             f"{kind}/{name}": {
                 "messages": traffic.messages,
