@@ -34,7 +34,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--truth",
         metavar="FILE",
-        help="truth: a recording, a table as `export` writes it, or a CSV with time, id and lat, lon[, alt] or x, y[, z]",
+        help="truth: a recording, a table as `export` writes it, or a CSV with time, id and lat, lon or x, y",
     )
     parser.add_argument(
         "--cutoff",
@@ -43,7 +43,10 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="largest error that still counts as followed, m (default: that which the recording keeps, else chosen)",
     )
     parser.add_argument(
-        "--every", type=argument(positive), metavar="S", help="score so often, s (default: as the recording keeps, else at each step)"
+        "--every",
+        type=argument(positive),
+        metavar="S",
+        help="score so often, s (default: as the recording keeps, else at each step)",
     )
     parser.add_argument("--centre", metavar="NAME", action="append", help="only this centre; may be repeated")
     parser.add_argument("--json", metavar="FILE", help="write every number here")
@@ -56,8 +59,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.commands.scored_mission import need_rerun, scored_mission
     from fusion_service.commands.sealed import find, say
     from fusion_service.errors import ReviewError, Stopped
-    from fusion_service.review.evaluation.results import results, text
     from fusion_service.recording.scoring import Scoring, scoring_of
+    from fusion_service.review.evaluation.results import results, text
     from fusion_service.review.evaluation.truth import NO_TRUTH, read_truth
     from fusion_service.review.outputs import check_page
 
@@ -69,6 +72,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
 
         need_matplotlib()
     done: list[Assessment] = []
+    truths = NO_TRUTH
     seals = []
     try:
         truths = read_truth(Path(args.truth)) if args.truth else NO_TRUTH
@@ -93,6 +97,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
         )
     print(text(done))
+    if truths.note:
+        print(truths.note)
     for recording, seal in zip(args.recordings, seals, strict=False):
         say(recording, seal)
     if args.json:

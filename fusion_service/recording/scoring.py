@@ -40,12 +40,14 @@ def scoring_of(path: str | Path) -> Scoring:
         with contextlib.suppress(ReviewError, FileNotFoundError, RuntimeError):
             for chunk in stored(file, [f"/__properties/{NAME}"]):
                 batch = chunk.to_record_batch()
-                for name in Scoring._fields:
-                    if name in batch.schema.names:
-                        found |= {name: value for cell in batch.column(name).to_pylist() for value in _numbers(cell)}
+                for name in set(Scoring._fields) & set(batch.schema.names):
+                    for value in map(_number, batch.column(name).to_pylist()):
+                        if value is not None:
+                            found[name] = value
     return Scoring(**found)
 
 
-def _numbers(cell: Any) -> list[float]:
-    some = cell if isinstance(cell, list) else [cell]
-    return [float(one) for one in some if isinstance(one, int | float) and math.isfinite(one) and one > 0][:1]
+def _number(cell: Any) -> float | None:
+    """The positive number of a cell, be it in a list."""
+    one = cell[0] if isinstance(cell, list) and cell else cell
+    return float(one) if isinstance(one, int | float) and math.isfinite(one) and one > 0 else None

@@ -89,7 +89,10 @@ def text(assessments: Sequence[Assessment]) -> str:
         lines += ["", *aligned(rules_table(rows), left=len(rules_table(rows)[0]) - NUMBERS)]
     for one in assessments:
         centre = next(iter(one.evaluations), next(iter(one.agreements), ""))
-        lines += ["", f"{one.book.path or 'mission'}" + (f", cut-off {facts(one)['cut-off']}" if one.chosen or one.kept else "")]
+        lines += [
+            "",
+            f"{one.book.path or 'mission'}" + (f", cut-off {facts(one)['cut-off']}" if one.chosen or one.kept else ""),
+        ]
         if one.book.bad:
             lines.append(f"not read: {facts(one)['not read']}")
         if one.evaluations:

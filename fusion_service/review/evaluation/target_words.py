@@ -63,7 +63,9 @@ def gap_words(gap: Gap, start: int) -> str:
     else:
         when = f"lost from {begin:.1f}" + ("" if gap.ended else f" to {end:.1f}")
     causes = [
-        _cause(code, gap) + (f" ({seconds:.3g} s)" if len(gap.causes) > 1 else "") for code, seconds in gap.causes if code
+        _cause(code, gap) + (f" ({seconds:.3g} s)" if len(gap.causes) > 1 else "")
+        for code, seconds in gap.causes
+        if code
     ]
     return f"{when}: {', '.join(causes)}"
 

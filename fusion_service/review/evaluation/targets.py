@@ -107,8 +107,7 @@ class TargetRecord:
 
 def spells(numbers: NDArray[np.int32], times: NDArray[np.int64]) -> list[Spell]:
     """Runs of one number (K,), but -1, at `times` (K,)."""
-    edges = np.flatnonzero(np.diff(numbers, prepend=numbers[0] if len(numbers) else 0)) if len(numbers) else []
-    begins = [0, *np.asarray(edges, dtype=np.intp).tolist()] if len(numbers) else []
+    begins = [0, *(np.flatnonzero(np.diff(numbers)) + 1).tolist()] if len(numbers) else []
     ends = [*begins[1:], len(numbers)]
     return [
         Spell(int(times[begin]), int(times[end - 1]), int(numbers[begin]))

@@ -33,8 +33,8 @@ PLACES = {
     10: (-300.0, -300.0),
     11: (300.0, -300.0),
 }
-"""Followed; outside all coverage; seen by none; confirmed late; two that merge; out of its gate; refused; lost and found
-again under another number; its track too far off; in no fused track."""
+"""Followed; outside all coverage; seen by none; confirmed late; two that merge; out of its gate; refused; lost and
+found again under another number; its track too far off; in no fused track."""
 BIG = 3 << 60
 """Added to the numbers of fused tracks: beyond 2^53."""
 
