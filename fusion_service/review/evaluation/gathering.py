@@ -21,7 +21,7 @@ from fusion_service.review.evaluation.reference import Reference, ScoredTruth
 from fusion_service.review.evaluation.scoring import Scores, Tally, plain
 from fusion_service.review.evaluation.targets import TargetRecord, target_records
 from fusion_service.review.snapshots import STALE_PERIODS, Block, Numbers
-from schemas import GlobalTracks
+from schemas import Frame, GlobalTracks
 
 __all__ = ["BLOCK", "Evaluation", "Gathering"]
 
@@ -39,7 +39,7 @@ class Evaluation:
     target; left_out: source -> why it could not be scored. begins, confirm (T,): when each target could first be
     known, an index into times, -1 for never, and the seconds from there to its first fused track, NaN without one.
     records: each target by itself, the worst first; sightings: what of each source, and of the centre (fused, None
-    without one), was assigned to the targets.
+    without one), was assigned to the targets. places (K, T, d): the true ones, m, in `frame`, NaN where there is none.
 
     shared: "seen_by_2", ..., "seen_by_2_or_more" -> over the pairs (target, time) on which so many sources had an
     assigned track: pairs, fused_missed (those without a fused track, which are in none of the other numbers), RMSE
@@ -63,6 +63,8 @@ class Evaluation:
     records: tuple[TargetRecord, ...]
     sightings: dict[str, Sighting]
     fused_sighting: Sighting | None
+    frame: Frame
+    places: Floats
 
     def as_json(self, scenario: str, rule: str, recording: str) -> dict[str, Any]:
         """The summary as plain values, ready for `json.dumps`."""
@@ -228,6 +230,8 @@ class Gathering:
                 records=records,
                 sightings=local,
                 fused_sighting=mine,
+                frame=self._reference.frame,
+                places=self._truth.states[:, :, : len(self._reference.axes)],
             )
         return found
 
