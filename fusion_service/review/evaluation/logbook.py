@@ -12,6 +12,7 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,7 +54,8 @@ class Logbook:
 
     truths; infos: newest of each source; accounts: by centre; traffic: by ("local", "intensity" or "global", name);
     latency: by (kind, name); bad: messages that do not decode, by reason; counts: messages by type; flat: centres
-    with a track whose height nobody told; labels: of global tracks, as recordings show them; platforms: by source.
+    with a track whose height nobody told; labels: of global tracks, as recordings show them; platforms: by source;
+    inputs: a digest of what the sources sent, in any order.
     """
 
     def __init__(self, messages: Iterable[Message] = ()) -> None:
@@ -67,6 +69,7 @@ class Logbook:
         self.origins: Counter[str] = Counter()
         self.first_pictures: dict[str, GlobalTracks] = {}
         self.flat: set[str] = set()
+        self.inputs = 0
         self.labels = Labels()
         self.platforms: dict[str, PlatformPath] = {}
         self.received: tuple[int, int] | None = None
@@ -221,6 +224,8 @@ class Logbook:
         self.traffic.setdefault((kind, name), Traffic()).tracks += size
         self.origins[message.origin] += 1
         self._delays.densities(message, received)
+        if not isinstance(message, GlobalTracks):
+            self.inputs = (self.inputs + crc32(message.means.tobytes(), message.time % 2**32)) % 2**64
 
     def _note_tracks(self, message: TrackMessage, arrival: int, received: int | None) -> None:
         kind, name = "local" if isinstance(message, LocalTracks) else "global", message.source

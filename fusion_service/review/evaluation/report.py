@@ -15,21 +15,19 @@ from fusion_service.review.evaluation.hull_table import TITLE, hull_table
 from fusion_service.review.evaluation.report_tables import html_table, mark
 from fusion_service.review.evaluation.report_text import CSS, WORDS
 from fusion_service.review.evaluation.report_truthless import without_truth
-from fusion_service.review.evaluation.results import facts, label, rows_of
+from fusion_service.review.evaluation.results import comparison_of, facts, label, lead, promises, rows_of
 from fusion_service.review.evaluation.scoring import Scores
 from fusion_service.review.evaluation.source_record import MOST_SAID, SourceRecords, sources_table
 from fusion_service.review.evaluation.tables import (
     NUMBERS,
     ScoredCentre,
     best_rows,
-    comparison,
     confirm_line,
     digits,
     fixed,
     power_of_ten,
     row_name,
     rules_table,
-    sentence,
     tracking_table,
 )
 from fusion_service.review.evaluation.target_words import HEAD, LEFT, missed_summary, target_table
@@ -66,15 +64,14 @@ def report(assessments: Sequence[Assessment]) -> str:
     rows = rows_of(assessments)
     title = ", ".join(dict.fromkeys(label(one) or "mission" for one in assessments))
     body = [f"<h1>Mission review: {escape(title)}</h1>"]
-    if rows:
-        body.append(f'<p class="lead">{escape(sentence(rows[0]) if len(rows) == 1 else comparison(rows))}</p>')
+    body += [f'<p class="lead">{escape(said)}</p>' for said in lead(assessments)]
     for one in assessments:
         if one.unscored:
             text = f"{label(one) or 'The mission'}: {one.unscored}. What follows needs no truth."
             body.append(f'<p class="lead">{escape(text)}</p>')
     body += [_facts(one) for one in assessments]
     if len(rows) > 1:
-        body += ["<h2>Rules beside each other</h2>", _rules(rows)]
+        body += ["<h2>Rules beside each other</h2>", _rules(rows, ranked=comparison_of(assessments).ranked)]
     body += _map(assessments[0])
     for one in assessments:
         if group := rows_of([one]):
@@ -112,13 +109,16 @@ def _facts(one: Assessment) -> str:
     return f'<dl class="facts">{lines}</dl>'
 
 
-def _rules(rows: Sequence[ScoredCentre]) -> str:
+def _rules(rows: Sequence[ScoredCentre], *, ranked: bool) -> str:
     head, *lines = rules_table(rows)
-    best = best_rows(rows)
+    best = best_rows(rows) if ranked else {}
     marks = {(index, k): "best" for k, name in enumerate(head) for index in best.get(name, ())}
     text = "The best of each column is marked (ANEES: nearest to 1). GOSPA, OSPA, RMSE in m; 2+: targets that several"
-    note = f'<p class="note">{text} sources track.</p>'
-    return html_table(head, lines, marks, left=len(head) - NUMBERS) + note
+    marked = f"{text} sources track." if ranked else "Not ranked: each row is of a mission of its own."
+    note = f'<p class="note">{marked} A rank is of this mission; what a rule promises holds in all.</p>'
+    said = promises(rows)
+    lines = [[*line, said[row.rule]] for line, row in zip(lines, rows, strict=True)]
+    return html_table([*head, "promise"], lines, marks, left=len(head) - NUMBERS, columns=[len(head)]) + note
 
 
 def _map(one: Assessment) -> list[str]:

@@ -8,6 +8,7 @@ from typing import Any
 
 from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.evaluation.assess import Assessment
+from fusion_service.review.evaluation.comparable import Comparison, compared
 from fusion_service.review.evaluation.hull_table import hull_lines
 from fusion_service.review.evaluation.scoring import plain
 from fusion_service.review.evaluation.tables import (
@@ -17,15 +18,18 @@ from fusion_service.review.evaluation.tables import (
     comparison,
     confirm_line,
     format_table,
+    row_name,
     rules_table,
     sentence,
     tracking_table,
     truthless_lines,
 )
 from fusion_service.review.evaluation.target_words import target_lines
+from fusion_service.rules import RULES
 from fusion_service.source_words import biases, consistency, state_of
+from fusion_service.ways import AUTO_PROMISE
 
-__all__ = ["facts", "label", "results", "rows_of", "rule_of", "text"]
+__all__ = ["comparison_of", "facts", "label", "lead", "promises", "results", "rows_of", "rule_of", "text"]
 
 
 def rule_of(assessment: Assessment, centre: str) -> str:
@@ -42,6 +46,33 @@ def rows_of(assessments: Sequence[Assessment]) -> list[ScoredCentre]:
         for one in assessments
         for centre, evaluation in one.evaluations.items()
     ]
+
+
+def comparison_of(assessments: Sequence[Assessment]) -> Comparison:
+    """Whether several recordings may be ranked."""
+    scored = [one for one in assessments if one.evaluations]
+    evaluations = [next(iter(one.evaluations.values())) for one in scored]
+    return compared([label(one) for one in scored], evaluations, [one.book.inputs for one in scored])
+
+
+def lead(assessments: Sequence[Assessment]) -> list[str]:
+    """How it went, in sentences: of one row, or which of several are best at what, where these may be compared."""
+    rows, said = rows_of(assessments), comparison_of(assessments)
+    if not rows:
+        return []
+    if len(rows) == 1:
+        return [sentence(rows[0])]
+    if said.ranked:
+        return [f"{comparison(rows)} {said.but}".strip()]
+    return [said.against, *(f"{row_name(row, rows)}: {sentence(row)}" for row in rows)]
+
+
+def promises(rows: Sequence[ScoredCentre]) -> dict[str, str]:
+    """What each rule that occurs promises, whatever its rank in this mission."""
+    known = {name: rule.promise for name, rule in RULES.items()} | {"auto": AUTO_PROMISE}
+    return {
+        rule: known.get(rule, "not known here: a rule of one's own") for rule in dict.fromkeys(r.rule for r in rows)
+    }
 
 
 def label(assessment: Assessment) -> str:
@@ -82,11 +113,12 @@ def facts(assessment: Assessment) -> dict[str, str]:
 def text(assessments: Sequence[Assessment]) -> str:
     """The plain summary: first in words, then tables; of several centres of a recording the tables of the first."""
     rows, lines = rows_of(assessments), []
-    if rows:
-        lines.append(sentence(rows[0]) if len(rows) == 1 else comparison(rows))
+    lines += lead(assessments)
     lines += [f"{label(one) or 'The mission'}: {one.unscored}." for one in assessments if one.unscored]
     if len(rows) > 1:
         lines += ["", *aligned(rules_table(rows), left=len(rules_table(rows)[0]) - NUMBERS)]
+        lines += ["", "A rank is of this mission; what a rule promises holds in all:"]
+        lines += [f"  {rule}: {promise}" for rule, promise in promises(rows).items()]
     for one in assessments:
         centre = next(iter(one.evaluations), next(iter(one.agreements), ""))
         lines += [
@@ -99,12 +131,14 @@ def text(assessments: Sequence[Assessment]) -> str:
             evaluation = one.evaluations[centre]
             if len(one.evaluations) > 1:
                 lines.append(f"of {centre} (--centre NAME shows another, --html and --json all of them):")
+            lines += ["Tracks against the truth:"]
             scored = {**evaluation.sources, **({"fused": evaluation.fused} if evaluation.centre else {})}
             lines += [format_table(evaluation), ""]
             lines += [*hull, ""] if (hull := hull_lines(scored)) else []
             lines += [*aligned(tracking_table(scored, len(evaluation.targets))), confirm_line(evaluation), ""]
             lines += target_lines(evaluation, int(evaluation.times[0]), one.book.labels)
-        lines += ["", *truthless_lines(one, centre)]
+        if truthless := truthless_lines(one, centre):
+            lines += ["", "Tracks against tracks, which needs no truth:", *truthless]
     return "\n".join(line for k, line in enumerate(lines) if line or k == 0 or lines[k - 1])
 
 
@@ -117,7 +151,15 @@ def results(assessments: Sequence[Assessment]) -> dict[str, Any]:
         for centre, evaluation in one.evaluations.items():
             told = evaluation.as_json(Path(path).stem, rule_of(one, centre), path)
             rows.append({**told, "more": evaluation.more_json()})
-    return {"rows": rows, "recordings": [_recording(one) for one in assessments]}
+    said = comparison_of(assessments)
+    return {
+        "rows": rows,
+        "recordings": [_recording(one) for one in assessments],
+        "ranked": said.ranked,
+        "not_ranked_because": said.against,
+        "compare_with_care": said.but,
+        "promises": promises(rows_of(assessments)),
+    }
 
 
 def _recording(one: Assessment) -> dict[str, Any]:
