@@ -83,8 +83,14 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     )
     if args.json is not None:
         Path(args.json).write_text(json.dumps(replay.as_json(), indent=1) + "\n", encoding="utf-8")
-    if replay.verdict is None or replay.stopped:
+    if replay.verdict is None:
         return
+    if replay.stopped:
+        verdict = replay.verdict
+        so_far = f", of which the first that differs is told: {verdict.told}" if verdict.first is not None else ""
+        raise ReviewError(
+            f"stopped: {verdict.compared} steps were compared{so_far}; the rest was not: nothing is verified"
+        )
     if replay.verdict.compared == 0 and replay.verdict.first is None:
         raise ReviewError("no step could be compared")
     if not replay.passed:

@@ -168,7 +168,7 @@ class Recorder:
         except MessageError as error:
             self.undecodable[error.reason] += 1
             self._bad[key, error.reason] += 1
-        at = self._scene.mission_time(message)
+        at = self._scene.mission_time(message, received)
         path = entity("raw", *key.removeprefix(self._prefix).split("/"))
         self._raw.add(path, raw, Stamp(received, at, self._arrival), (key, data))
         self._sealer.add(key, data, received)
