@@ -6,12 +6,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
 from fusion_service.recording import Recorder, read
 from fusion_service.recording.drawing.mission_clock import AHEAD, MissionClock
-from schemas import Entry, Message, StepLog, encode, global_key, local_key
+from schemas import Ecef, Entry, Message, StepLog, encode, global_key, local_key
 from tests.helpers.missed import mission
 from tests.helpers.missions import FRAME, SECOND, START, STILL, at, info, picture, tracks, truth
 from tests.recording.contents import key_of, record, rows, texts
@@ -113,3 +114,16 @@ def test_what_is_ahead_of_the_centre_by_more_than_an_hour_is_not_on_it() -> None
     for off, there in ((AHEAD, True), (AHEAD + 1, False), (-AHEAD, True), (-AHEAD - 1, False)):
         message = replace(truth(0, [1], STILL, frame=FRAME), time=START + off)
         assert (clock.place(message, START) is not None) == there
+
+
+def test_a_sensor_without_a_place_on_earth_is_said_in_a_line(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Two sources in ECEF that stand, by their word, in the centre of the Earth."""
+    nowhere: dict[str, Any] = {"space": ("x", "y", "z"), "frame": Ecef(), "means": np.zeros((1, 3))}
+    said: list[Message] = [info("a", frame=Ecef()), info("b", frame=Ecef())]
+    said += [tracks(name, t, [1], [], **nowhere) for t in range(8) for name in "ab"]
+    for more in ([], [picture(3, [1], STILL)]):
+        path = tmp_path / f"{len(more)}.rrd"
+        recorder = record(path, *said, *more)
+        assert len(list(read(path))) == len(said) + len(more)
+        assert "Traceback" not in caplog.text
+        assert recorder.undrawn.total() >= 2

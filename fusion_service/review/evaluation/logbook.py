@@ -45,6 +45,8 @@ __all__ = ["Logbook"]
 
 NO_FRAME = Local("none")
 """Of a centre's pictures before it knows a frame."""
+AROUND = 3600 * 10**9
+"""ns."""
 SHOWING_EVERY = 8
 """Messages between calls of `progress`."""
 
@@ -174,10 +176,16 @@ class Logbook:
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """Mission time of the first and the last tracks or truth, ns."""
-        times = [one.first for one in self.traffic.values()] + [one.last for one in self.traffic.values()]
-        times += [truth.time for truth in self.truths]
-        return (min(times), max(times)) if times else None
+        """Mission time of the first and the last tracks or truth, ns; of a source's, where there is a centre or truth,
+        those within `AROUND` of theirs: one wrong clock does not make a mission begin in 1970."""
+        sure = [truth.time for truth in self.truths]
+        for (kind, _), one in self.traffic.items():
+            sure += [one.first, one.last] if kind == "global" else []
+        times = np.frombuffer(self._columns["time"], dtype=np.int64)
+        if sure:
+            times = times[(times >= min(sure) - AROUND) & (times <= max(sure) + AROUND)]
+        ends = [*sure, *([int(times.min()), int(times.max())] if len(times) else [])]
+        return (min(ends), max(ends)) if ends else None
 
     def _order(self, wanted: Callable[[str, str], bool]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Arrival numbers of what is wanted in the order of places, and as they came."""
