@@ -25,7 +25,10 @@ __all__ = [
     "VERMILION",
     "Colour",
     "centre_colours",
+    "line_style",
+    "marker_of",
     "packed",
+    "paper_colour",
     "screen_source_colours",
     "series_colour",
     "shade",
@@ -34,6 +37,11 @@ __all__ = [
 
 Colour = tuple[int, int, int]
 """Red, green and blue of a screen, 0 to 255."""
+
+TINTS = ((1.0, 0.0), (0.5, 127.5), (0.6, 0.0))
+"""Share of a colour's light, and what is added to it, at each turn of `SOURCES`."""
+PAPER_STYLES = ("-", "--", ":")
+SCREEN_MARKERS = (None, "square", "diamond")
 
 PAPER_FUSED = "#000000"
 PAPER_TRUTH = "#999999"
@@ -49,9 +57,36 @@ SCREEN_GRID: Colour = (58, 58, 58)
 SCREEN_WARNING: Colour = (240, 190, 60)
 
 
+def paper_colour(index: int) -> str:
+    """The colour "#rrggbb" of the index-th source: `SOURCES`, then these half-way to white, then with less light."""
+    red, green, blue = _rgb(SOURCES[index % len(SOURCES)])
+    share, white = TINTS[index // len(SOURCES) % len(TINTS)]
+    return "#" + "".join(f"{round(share * part + white):02x}" for part in (red, green, blue))
+
+
 def source_colours(names: Iterable[str]) -> dict[str, str]:
     """A colour "#rrggbb" for each source, by alphabetical order: the same for the same set of names."""
-    return {name: SOURCES[index % len(SOURCES)] for index, name in enumerate(sorted(set(names)))}
+    return {name: paper_colour(index) for index, name in enumerate(sorted(set(names)))}
+
+
+def line_style(colour: str) -> str:
+    """How Matplotlib draws a line of that colour: those beyond the seven of `SOURCES` are dashed, then dotted."""
+    return PAPER_STYLES[_turn(_rgb(colour))] if colour.startswith("#") else PAPER_STYLES[0]
+
+
+def marker_of(colour: Colour) -> str | None:
+    """What marks the points of a series of that colour on a screen, by Rerun's names; None for the seven of
+    `SOURCES`, and what is no source's."""
+    return SCREEN_MARKERS[_turn(colour)]
+
+
+def _turn(colour: Colour) -> int:
+    """How often the colours of sources had been used up before this one."""
+    for turn in range(1, len(TINTS)):
+        first = turn * len(SOURCES)
+        if any(_rgb(paper_colour(index)) == colour for index in range(first, first + len(SOURCES))):
+            return turn
+    return 0
 
 
 def screen_source_colours(names: Iterable[str]) -> dict[str, Colour]:

@@ -350,7 +350,7 @@ class Recorder:
         frame = drawing.chart.frame if drawing.chart else None
         seen: dict[str, Any] = {"trails": drawing.trails, "trail": self._trail, "centres": sorted(drawing.centres)}
         if self._focus is None:
-            return blueprint(
-                frame, drawing.bounds, crowded=self._scene.crowded, supervised=self._scene.supervised, **seen
-            )
+            scene = self._scene
+            seen |= {"crowded": scene.crowded, "supervised": scene.supervised, "assessed": scene.assessed}
+            return blueprint(frame, drawing.bounds, **seen)
         return track_blueprint(frame, drawing.bounds, drawing.label(self._focus), reach=drawing.reach, **seen)

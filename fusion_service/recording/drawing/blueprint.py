@@ -36,11 +36,13 @@ def blueprint(
     centres: Sequence[str] = (),
     crowded: bool = False,
     supervised: bool = False,
+    assessed: bool = True,
 ) -> Any:
     """The blueprint for a picture in `frame` within `bounds` (south-west, north-east; m), of whose `trails`
     (entities) the last `trail` seconds are seen. centres: whose global tracks it shows. crowded: there are too many
     targets or tracks for a legend; a series under the pointer says its name. supervised: there are series of how far
-    sources are trusted, and shifted."""
+    sources are trusted, and shifted. assessed: there are errors against a truth; without, what needs none comes
+    first."""
     rr = import_rerun()
     import rerun.blueprint as rrb
 
@@ -56,16 +58,18 @@ def blueprint(
         ]
         return rrb.Vertical(*views, name=name)
 
-    upper = [
-        charts("error", "Error per target (m)"),
-        charts("existence", "Existence", 1.05),
-        _chart(rr, rrb, "/counts", "Tracks"),
+    counts, existence = _chart(rr, rrb, "/counts", "Tracks"), charts("existence", "Existence", 1.05)
+    influence = charts("influence", "Influence (weights per source)", 1.05)
+    traffic = [
+        _chart(rr, rrb, "/rate", "Messages per s"),
+        _chart(rr, rrb, "/apart", "Sources apart (m)"),
+        _chart(rr, rrb, "/offset", "Delays (s)"),
     ]
-    lower = [
-        charts("nees", "NEES per target", 8.0),
-        _chart(rr, rrb, "/anees", "Mean NEES", 4.0),
-        charts("influence", "Influence (weights per source)", 1.05),
-    ]
+    if assessed:
+        upper = [charts("error", "Error per target (m)"), existence, counts]
+        lower = [charts("nees", "NEES per target", 8.0), _chart(rr, rrb, "/anees", "Mean NEES", 4.0), influence]
+    else:
+        upper, lower, traffic = [counts, traffic[0], existence], [traffic[1], traffic[2], influence], []
     watched = [
         _chart(rr, rrb, "/consistency", "Sources (1 is right)", 3.0),
         _chart(rr, rrb, "/clock", "Clocks (s)"),
@@ -79,7 +83,7 @@ def blueprint(
         [
             rrb.Tabs(*upper, active_tab=0),
             rrb.Tabs(*lower, active_tab=0),
-            rrb.Tabs(*told, *(watched if supervised else []), active_tab=0),
+            rrb.Tabs(*told, *(watched if supervised else []), *traffic, active_tab=0),
         ],
     )
 
@@ -188,6 +192,7 @@ def _chart(
         axis_x=rrb.TimeAxis(view_range=whole),
         axis_y=None if top is None else rrb.ScalarAxis(range=(0.0, top)),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        background=rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True),  # the colours are for a dark view
         **more,
     )
 

@@ -18,6 +18,7 @@ from fusion_service.recording.drawing.log import EventLog
 from fusion_service.recording.drawing.mission_clock import MissionClock
 from fusion_service.recording.drawing.sources import SourceCharts
 from fusion_service.recording.drawing.tracks import Drawing
+from fusion_service.recording.drawing.traffic import TrafficCharts
 from schemas import (
     FAULTS,
     Frame,
@@ -70,6 +71,9 @@ class Scene:
         self.undrawn: Counter[str] = Counter()
         self._charts = Charts(columns, focus)
         self._sources = SourceCharts(columns)
+        self._traffic = TrafficCharts(columns)
+        self.assessed = False
+        """Whether there are errors against a truth."""
         self._matcher = TruthMatcher(cutoff)
         self._wholes = Wholes()
         self._clock = MissionClock()
@@ -81,6 +85,7 @@ class Scene:
         """A new part of the recording begins."""
         self._charts.restart()
         self._sources.restart()
+        self._traffic.restart()
         self.drawing.changed = True
 
     @property
@@ -136,6 +141,8 @@ class Scene:
         self.drawing.colour_sources()
         if self.crowded != self._charts.crowded:
             self.crowded = self.drawing.changed = True
+        if self.assessed < self._charts.assessed:
+            self.assessed = self.drawing.changed = True
         if self.supervised != self._sources.seen:
             self.supervised = self.drawing.changed = True
 
@@ -203,6 +210,7 @@ class Scene:
                 drawing.clear(source, stamp)
             if stamp.time is not None:
                 self._sources.status(message, drawing.colours, stamp)
+                self._traffic.status(message, drawing.colours, stamp)
         elif isinstance(message, StepLog):
             event_log.step(message, stamp)
         elif isinstance(message, SensorInfo):
@@ -222,6 +230,7 @@ class Scene:
                 self._matcher.step(message, stamp)
             if drawing.chart is not None:
                 self._too_many(message, "components", drawing.global_tracks(message, sound, stamp), stamp)
+                self._traffic.step(message, drawing.chart, stamp)
             unseen = charts.step(message, drawing.colours, drawing.centres, drawing.label, stamp)
             self._too_many(message, "series of existence", unseen, stamp)
         else:
@@ -231,6 +240,7 @@ class Scene:
                 over = drawing.intensity(message, sound, stamp)
             self._too_many(message, "components", over, stamp)
             charts.local(message, drawing.colours, stamp)
+            self._traffic.heard(message, drawing.colours, stamp)
 
     def _too_many(self, message: Message, what: str, count: int, stamp: Stamp) -> None:
         if count:
