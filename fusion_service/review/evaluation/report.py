@@ -118,7 +118,10 @@ def _rules(rows: Sequence[ScoredCentre], *, ranked: bool) -> str:
     note = f'<p class="note">{marked} A rank is of this mission; what a rule promises holds in all.</p>'
     said = promises(rows)
     lines = [[*line, said[row.rule]] for line, row in zip(lines, rows, strict=True)]
-    return html_table([*head, "promise"], lines, marks, left=len(head) - NUMBERS, columns=[len(head)]) + note
+    return (
+        html_table([*head, "promise"], lines, marks, left=len(head) - NUMBERS, columns=[len(head)], wide=len(head))
+        + note
+    )
 
 
 def _map(one: Assessment) -> list[str]:
@@ -181,7 +184,7 @@ def _targets(rows: Sequence[ScoredCentre], one: Assessment) -> list[str]:
         summary, start = missed_summary(evaluation), int(evaluation.times[0])
         found += [f"<p>{escape(summary)}</p>"] if summary else []
         table = target_table(evaluation, start, one.book.labels, MOST_TARGETS)
-        found.append(html_table(HEAD, table[1:], columns=LEFT))
+        found.append(html_table(HEAD, table[1:], columns=LEFT, wide=len(HEAD) - 1))
         left = len(evaluation.records) - MOST_TARGETS
         more = f" {left} more are in --json." if left > 0 else ""
         found.append(f'<p class="note">The worst first; times in s from the first scored one.{more}</p>')

@@ -16,9 +16,10 @@ def html_table(
     marks: dict[tuple[int, int], str] | None = None,
     left: int = 1,
     columns: Sequence[int] = (),
+    wide: int | None = None,
 ) -> str:
     """marks: (row, column) -> class of the cell; a row that begins with "fused" stands out. The first `left` columns,
-    one without a name, and `columns`, stand to the left."""
+    one without a name, and `columns`, stand to the left; the text of the column `wide` is broken into lines."""
     marks = marks or {}
     to_left = {*range(1, left), *columns} - {0}
     parts = ["<tr>", *(f"<th{_left(k in to_left)}>{escape(cell)}</th>" for k, cell in enumerate(head)), "</tr>"]
@@ -26,7 +27,8 @@ def html_table(
         parts.append('<tr class="fused">' if line and line[0].startswith("fused") else "<tr>")
         for k, cell in enumerate(line):
             shade = marks.get((index, k), "")
-            classes = " ".join(filter(None, (shade, "left" if k in to_left or (k and not head[k]) else "")))
+            side = "left" if k in to_left or (k and not head[k]) else ""
+            classes = " ".join(filter(None, (shade, side, "wrap" if k == wide else "")))
             parts.append(f'<td class="{classes}">' if classes else "<td>")
             parts.append(f"{escape(cell)}</td>")
         parts.append("</tr>")
