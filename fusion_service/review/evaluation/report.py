@@ -184,7 +184,9 @@ def _targets(rows: Sequence[ScoredCentre], one: Assessment) -> list[str]:
         summary, start = missed_summary(evaluation), int(evaluation.times[0])
         found += [f"<p>{escape(summary)}</p>"] if summary else []
         table = target_table(evaluation, start, one.book.labels, MOST_TARGETS)
-        found.append(html_table(HEAD, table[1:], columns=LEFT, wide=len(HEAD) - 1))
+        order = [*range(3), len(HEAD) - 1, *range(3, len(HEAD) - 1)]
+        head, *lines = ([line[k] for k in order] for line in table)
+        found.append(html_table(head, lines, columns=[order.index(k) for k in LEFT], wide=3))
         left = len(evaluation.records) - MOST_TARGETS
         more = f" {left} more are in --json." if left > 0 else ""
         found.append(f'<p class="note">The worst first; times in s from the first scored one.{more}</p>')
