@@ -15,7 +15,15 @@ from fusion_service.review.evaluation.hull_table import TITLE, hull_table
 from fusion_service.review.evaluation.report_tables import html_table, mark
 from fusion_service.review.evaluation.report_text import CSS, WORDS
 from fusion_service.review.evaluation.report_truthless import without_truth
-from fusion_service.review.evaluation.results import comparison_of, facts, label, lead, promises, rows_of
+from fusion_service.review.evaluation.results import (
+    comparison_of,
+    facts,
+    label,
+    lead,
+    promises,
+    rows_of,
+    truthless_lead,
+)
 from fusion_service.review.evaluation.scoring import Scores
 from fusion_service.review.evaluation.source_record import MOST_SAID, SourceRecords, sources_table
 from fusion_service.review.evaluation.tables import (
@@ -67,7 +75,7 @@ def report(assessments: Sequence[Assessment]) -> str:
     body += [f'<p class="lead">{escape(said)}</p>' for said in lead(assessments)]
     for one in assessments:
         if one.unscored:
-            text = f"{label(one) or 'The mission'}: {one.unscored}. What follows needs no truth."
+            text = f"{label(one) or 'The mission'}: {one.unscored}. {truthless_lead(one)} What follows needs no truth."
             body.append(f'<p class="lead">{escape(text)}</p>')
     body += [_facts(one) for one in assessments]
     if len(rows) > 1:

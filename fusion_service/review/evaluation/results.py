@@ -18,6 +18,8 @@ from fusion_service.review.evaluation.tables import (
     comparison,
     confirm_line,
     format_table,
+    pair_words,
+    percent,
     row_name,
     rules_table,
     sentence,
@@ -29,7 +31,21 @@ from fusion_service.rules import RULES
 from fusion_service.source_words import biases, consistency, state_of
 from fusion_service.ways import AUTO_PROMISE
 
-__all__ = ["comparison_of", "facts", "label", "lead", "promises", "results", "rows_of", "rule_of", "text"]
+__all__ = [
+    "comparison_of",
+    "facts",
+    "label",
+    "lead",
+    "promises",
+    "results",
+    "rows_of",
+    "rule_of",
+    "text",
+    "truthless_lead",
+]
+
+MOST_NAMED = 6
+"""Sources and pairs of them that a sentence names."""
 
 
 def rule_of(assessment: Assessment, centre: str) -> str:
@@ -65,6 +81,31 @@ def lead(assessments: Sequence[Assessment]) -> list[str]:
     if said.ranked:
         return [f"{comparison(rows)} {said.but}".strip()]
     return [said.against, *(f"{row_name(row, rows)}: {sentence(row)}" for row in rows)]
+
+
+def truthless_lead(one: Assessment) -> str:
+    """What is there of a mission without truth, in a sentence."""
+    book = one.book
+    sources = [
+        f"{name} {1 / traffic.interval if traffic.interval > 0 else 0:.3g} messages a second of "
+        f"{traffic.tracks / max(traffic.messages, 1):.3g} {'tracks' if kind == 'local' else 'components'}"
+        for (kind, name), traffic in sorted(book.traffic.items())
+        if kind != "global"
+    ]
+    more = f" and {len(sources) - MOST_NAMED} more" if len(sources) > MOST_NAMED else ""
+    said = [f"{len(sources)} sources ({'; '.join(sources[:MOST_NAMED])}{more})" if sources else "no sources"]
+    for name in book.centres[:1]:
+        account = book.accounts[name]
+        shown, pictures = sum(account.shown.values()), max(account.pictures, 1)
+        several = sum(count for n, count in account.shown.items() if n > 1)
+        fed = f", {percent(several / shown)} of them by several sources" if shown else ""
+        said.append(f"centre {name}: {shown / pictures:.3g} confirmed tracks on average{fed}")
+    agreement = next(iter(one.agreements.values()), None)
+    pairs = [pair for pair in (agreement.pairs.items() if agreement else ()) if pair[1].n]
+    odd = [f"{' and '.join(names)}: {pair_words(found)}" for names, found in pairs if pair_words(found) != "as said"]
+    if pairs:
+        said.append("; ".join(odd[:MOST_NAMED]) if odd else "sources agree with each other as their covariances say")
+    return f"There are {'; '.join(said)}."
 
 
 def promises(rows: Sequence[ScoredCentre]) -> dict[str, str]:
@@ -114,7 +155,9 @@ def text(assessments: Sequence[Assessment]) -> str:
     """The plain summary: first in words, then tables; of several centres of a recording the tables of the first."""
     rows, lines = rows_of(assessments), []
     lines += lead(assessments)
-    lines += [f"{label(one) or 'The mission'}: {one.unscored}." for one in assessments if one.unscored]
+    lines += [
+        f"{label(one) or 'The mission'}: {one.unscored}. {truthless_lead(one)}" for one in assessments if one.unscored
+    ]
     if len(rows) > 1:
         lines += ["", *aligned(rules_table(rows), left=len(rules_table(rows)[0]) - NUMBERS)]
         lines += ["", "A rank is of this mission; what a rule promises holds in all:"]
