@@ -1,4 +1,4 @@
-"""One colour for one thing, on paper ("#rrggbb", on white) and on a screen (`Colour`, on a dark view and a light map).
+"""One colour for one thing, on paper ("#rrggbb", on white) and on a screen (`Colour`, on dark views and light ones).
 
 Sources have the same colours on both. What is fused is black on paper, and red on a screen, where each centre has a
 colour of its own.
@@ -50,11 +50,11 @@ SOURCES = (BLUE, ORANGE, GREEN, "#cc79a7", SKY, VERMILION, "#f0e442")
 """Okabe and Ito (2008), to be told apart by the colour-blind; its black and a grey are for fused tracks and truth."""
 
 SCREEN_FUSED: Colour = (255, 62, 62)
-SCREEN_CENTRES: tuple[Colour, ...] = (SCREEN_FUSED, (190, 255, 70), (255, 90, 235), (170, 135, 255))
+SCREEN_CENTRES: tuple[Colour, ...] = (SCREEN_FUSED, (120, 190, 30), (240, 80, 220), (150, 115, 250))
 SCREEN_TRUTH: Colour = (150, 150, 150)
-SCREEN_NEUTRAL: Colour = (205, 205, 205)
-SCREEN_GRID: Colour = (58, 58, 58)
-SCREEN_WARNING: Colour = (240, 190, 60)
+SCREEN_NEUTRAL: Colour = (140, 140, 140)
+SCREEN_GRID: Colour = (128, 128, 128)
+SCREEN_WARNING: Colour = (225, 165, 40)
 
 
 def paper_colour(index: int) -> str:
@@ -107,7 +107,7 @@ def shade(colour: Colour, share: float) -> Colour:
 
 def series_colour(index: int) -> Colour:
     """The colour of the index-th of any number of series: hues a golden section apart."""
-    red, green, blue = colorsys.hsv_to_rgb((0.08 + index * 0.618034) % 1.0, 0.62, 0.95)
+    red, green, blue = colorsys.hsv_to_rgb((0.08 + index * 0.618034) % 1.0, 0.7, 0.85)
     return round(red * 255), round(green * 255), round(blue * 255)
 
 

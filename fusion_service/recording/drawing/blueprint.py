@@ -24,7 +24,6 @@ METRES_PER_PIXEL = 156543.034
 TIMES = ("time", "received")
 STACKED = 4
 """Centres whose charts are stacked; those of more stand in one view."""
-BACKGROUND = (16, 16, 18)
 
 
 def blueprint(
@@ -73,7 +72,7 @@ def blueprint(
     watched = [
         _chart(rr, rrb, "/consistency", "Sources (1 is right)", 3.0),
         _chart(rr, rrb, "/clock", "Clocks (s)"),
-        rrb.Spatial2DView(origin="/registration", name="Registration (m)", background=BACKGROUND),
+        rrb.Spatial2DView(origin="/registration", name="Registration (m)"),
     ]
     pages = [rrb.TextDocumentView(origin=entity("health", one), name=f"Health: {one}") for one in centres]
     told = [_log(rrb, "/log", "Status log"), *(pages or [rrb.TextDocumentView(origin="/health", name="Health")])]
@@ -120,7 +119,6 @@ def track_blueprint(
         origin="/near",
         name=f"Seen from track {track}: its sources in their colours, the truth grey",
         visual_bounds=rrb.VisualBounds2D(x_range=(-reach, reach), y_range=(-reach, reach)),
-        background=BACKGROUND,
     )
     left = rrb.Vertical(rrb.Tabs(*pictures, active_tab=0), along)
     return _whole(rrb, left, [*series, rrb.Tabs(*told, active_tab=0)])
@@ -160,7 +158,6 @@ def _pictures(
             name=name,
             overrides=history,
             visual_bounds=sight,
-            background=BACKGROUND,
         )
 
     views = [plane("Local picture (east right, north up)", ["/picture/**", "/grid/**"])]
@@ -192,7 +189,6 @@ def _chart(
         axis_x=rrb.TimeAxis(view_range=whole),
         axis_y=None if top is None else rrb.ScalarAxis(range=(0.0, top)),
         plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
-        background=rrb.archetypes.PlotBackground(color=BACKGROUND, show_grid=True),  # the colours are for a dark view
         **more,
     )
 

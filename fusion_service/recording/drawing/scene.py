@@ -154,7 +154,7 @@ class Scene:
 
     def _timely(self, items: list[tuple[Message, Stamp]]) -> list[tuple[Message, Stamp]]:
         """Those that are on the mission's timeline, at their time; the others are left out, and said."""
-        found = []
+        found: list[tuple[Message, Stamp]] = []
         for message, stamp in items:
             if not isinstance(message, LocalTracks | LocalIntensity | Truth):
                 found.append((message, stamp))

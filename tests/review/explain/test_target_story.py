@@ -38,8 +38,8 @@ def test_who_saw_it_and_which_tracks_followed_it_is_told(flown: Path, capsys: py
     assert main(["explain", str(flown), "--target", "9"]) == 0
     out = capsys.readouterr().out
     assert "cut-off 50 m" in out
-    told = dict(reversed(line.split("  ", 1)) for line in out.splitlines() if line[:1].isdigit())
-    spans = {what.strip(): when for what, when in told.items()}
+    told = [line.split("  ", 1) for line in out.splitlines() if line[:1].isdigit()]
+    spans = {what.strip(): when for when, what in told}
     assert spans["covered by a"] == spans["covered by b"] == f"0.0-{SECONDS:.1f}"
     assert spans["followed by track 90, RMSE 0 m"] == "0.0-6.0"
     assert spans["followed by track 95, RMSE 0 m"] == f"14.0-{SECONDS:.1f}"
