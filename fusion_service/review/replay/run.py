@@ -249,4 +249,5 @@ def _numbers(player: Player) -> dict[str, Any]:
 
 
 def _difference(one: Difference) -> dict[str, Any]:
-    return {**one._asdict(), "relative": None if math.isnan(one.relative) else one.relative}
+    track = None if one.track is None else str(one.track)  # ids have more bits than JavaScript keeps of a number
+    return {**one._asdict(), "track": track, "relative": None if math.isnan(one.relative) else one.relative}
