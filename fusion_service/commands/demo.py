@@ -12,6 +12,7 @@ __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
 HELP = "A whole mission: hub, service, clients and recorder as processes, then a table, a map and a recording."
 EXAMPLE = """fusion-service demo
+  fusion-service demo --live
   fusion-service demo --rule hmd-ga --json result.json
   fusion-service demo --memory tracklet
   fusion-service demo --fault radar2:clock=0.5,heading=0.3 --set registration=correct
@@ -61,6 +62,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         "--out", metavar="DIR", help="folder of the results (default runs/<scenario>-<rule>-<UTC time>)"
     )
     parser.add_argument("--json", metavar="FILE", help="write the scores here")
+    parser.add_argument(
+        "--live", action="store_true", help="open the Rerun viewer while it flies; without a screen, say how to look on"
+    )
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
@@ -82,4 +86,5 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         out=Path(args.out) if args.out else None,
         json_path=Path(args.json) if args.json else None,
         stop=stop,
+        live=args.live,
     )

@@ -5,17 +5,15 @@ from __future__ import annotations
 import argparse
 import json
 import threading
-from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fusion_service.commands.sealed import add_authority
 from fusion_service.process import argument, positive
-from fusion_service.progress import Progress
 
 if TYPE_CHECKING:
     from fusion_service.review.evaluation import Assessment
-    from schemas import Truth
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
@@ -33,15 +31,22 @@ SAMPLE = 20_000
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
     parser.add_argument("recordings", metavar="FILE", nargs="+", help="recordings (.rrd)")
-    parser.add_argument("--truth", metavar="FILE", help="truth: a recording, or a table as `export` writes it")
+    parser.add_argument(
+        "--truth",
+        metavar="FILE",
+        help="truth: a recording, a table as `export` writes it, or a CSV with time, id and lat, lon or x, y",
+    )
     parser.add_argument(
         "--cutoff",
         type=argument(positive),
         metavar="M",
-        help="largest error that still counts as followed, m (default: chosen)",
+        help="largest error that still counts as followed, m (default: that which the recording keeps, else chosen)",
     )
     parser.add_argument(
-        "--every", type=argument(positive), metavar="S", help="score so often, s (default: at each step)"
+        "--every",
+        type=argument(positive),
+        metavar="S",
+        help="score so often, s (default: as the recording keeps, else at each step)",
     )
     parser.add_argument("--centre", metavar="NAME", action="append", help="only this centre; may be repeated")
     parser.add_argument("--json", metavar="FILE", help="write every number here")
@@ -51,26 +56,34 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Score the recordings. Raises `ReviewError`, OSError."""
+    from fusion_service.commands.scored_mission import need_rerun, scored_mission
     from fusion_service.commands.sealed import find, say
     from fusion_service.errors import ReviewError, Stopped
+    from fusion_service.recording.scoring import Scoring, scoring_of
     from fusion_service.review.evaluation.results import results, text
-    from fusion_service.review.evaluation.truth import read_truth
+    from fusion_service.review.evaluation.truth import NO_TRUTH, read_truth
     from fusion_service.review.outputs import check_page
 
     for page in filter(None, (args.json, args.html)):
         check_page(page, *args.recordings, *filter(None, [args.truth]))
-    _need_rerun()
+    need_rerun()
     if args.html:
         from fusion_service.review.evaluation.report import need_matplotlib
 
         need_matplotlib()
     done: list[Assessment] = []
+    truths = NO_TRUTH
     seals = []
     try:
-        truths = read_truth(Path(args.truth)) if args.truth else []
+        truths = read_truth(Path(args.truth)) if args.truth else NO_TRUTH
+        kept = scoring_of(args.recordings[0])
+        how = Scoring(args.cutoff or kept.cutoff, args.every or kept.every)
         for path in map(Path, args.recordings):
-            cutoff = args.cutoff or (done[0].c if done else None)
-            scored = _assess(path, truths, cutoff, args, stop)
+            how = how._replace(cutoff=how.cutoff or (done[0].c if done else None))
+            rows = SAMPLE if args.html else 0
+            scored = scored_mission(path, truths, how, stop, centres=args.centre or (), rows=rows)
+            if not (done or args.cutoff) and kept.cutoff:
+                scored = replace(scored, kept=True)
             seals.append(find(str(path), args.ca, stop))
             done.append(scored)
     except Stopped:
@@ -84,6 +97,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
         )
     print(text(done))
+    if truths.note:
+        print(truths.note)
     for recording, seal in zip(args.recordings, seals, strict=False):
         say(recording, seal)
     if args.json:
@@ -97,49 +112,3 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
 
         Path(args.html).write_text(report(done), encoding="utf-8")
         print(f"page:   {args.html}")
-
-
-def _need_rerun() -> None:
-    from fusion_service.errors import ReviewError
-    from fusion_service.recording.columns import import_rerun
-
-    try:
-        import_rerun()
-    except ImportError as error:
-        raise ReviewError(str(error)) from None
-
-
-def _assess(
-    path: Path, truths: list[Truth], cutoff: float | None, args: argparse.Namespace, stop: threading.Event
-) -> Assessment:
-    from fusion_service.errors import ReviewError, Stopped
-    from fusion_service.review.evaluation import assess
-    from fusion_service.review.evaluation.logbook import Logbook
-
-    with Progress(path.name) as bar:
-        size = max(path.stat().st_size, 1) if path.is_file() else 1
-
-        def showing(begin: float, share: float, scale: float) -> Callable[[float], None]:
-            def show(done: float) -> None:
-                if stop.is_set():
-                    raise Stopped
-                bar.show(begin + share * min(done / scale, 1.0))
-
-            return show
-
-        book = Logbook.read(path, showing(0.0, 0.3, size))
-        if not book.traffic:
-            raise ReviewError(f"{path} holds no tracks, so there is nothing to evaluate")
-        chosen = [name for name in args.centre or () if name in book.centres]
-        if args.centre and not chosen:
-            there = ", ".join(book.centres) or "none"
-            raise ReviewError(f"{path} has no centre {' or '.join(map(repr, args.centre))}; there are: {there}")
-        return assess(
-            book,
-            c=cutoff,
-            every=args.every,
-            centres=chosen,
-            truths=truths,
-            progress=showing(0.3, 0.7, 1.0),
-            rows=SAMPLE if args.html else 0,
-        )

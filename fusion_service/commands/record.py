@@ -15,7 +15,7 @@ from fusion_service.bus.options import bus_options
 from fusion_service.commands.arguments import duration, port, size
 from fusion_service.commands.observed import add_metrics, observed
 from fusion_service.hangup import on_hangup
-from fusion_service.process import argument
+from fusion_service.process import argument, positive
 
 if TYPE_CHECKING:
     from fusion_service.bus.security import Security
@@ -49,7 +49,15 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="of this recorder, for `status` and `top` (default: its certificate's, or host's)",
     )
-    parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
+    parser.add_argument(
+        "--cutoff",
+        type=argument(positive),
+        metavar="M",
+        help="largest error that still counts as followed, m: of the picture, and kept for `evaluate`",
+    )
+    parser.add_argument(
+        "--every", type=argument(positive), metavar="S", help="how often `evaluate` is to score, s: kept for it"
+    )
     parser.add_argument(
         "--flush",
         type=argument(duration),
@@ -165,6 +173,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             realm=args.realm,
             stop=stop,
             cutoff=args.cutoff,
+            every=args.every,
             draw=not args.no_draw,
             rotation=rotation,
             signer=signer,

@@ -6,8 +6,12 @@ import argparse
 import json
 import threading
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from fusion_service.commands.sealed import add_authority
+
+if TYPE_CHECKING:
+    from fusion_service.review.replay import Replay
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
@@ -55,7 +59,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Fuse it again. Raises `UsageError`, `ConfigError`, `ReviewError`: of --verify too, where the tracks differ."""
     from fusion_service.commands.sealed import tell
     from fusion_service.compiled import is_kept, use
-    from fusion_service.errors import ReviewError, UsageError
+    from fusion_service.errors import ReviewError, Stopped, UsageError
     from fusion_service.review.outputs import check_page, check_recording
     from fusion_service.review.replay import run_replay
 
@@ -65,7 +69,12 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         check_page(args.json, args.recording, *filter(None, [args.config]))
     if args.out is not None:
         check_recording(args.out, args.recording)
-    tell(args.recording, args.ca, stop)
+    try:
+        tell(args.recording, args.ca, stop)
+    except Stopped as stopped:
+        if args.verify:
+            raise ReviewError(f"{stopped}: the recording is not verified") from None
+        raise
     if is_kept():  # the same bits, sooner
         use("auto")
     replay = run_replay(
@@ -83,10 +92,20 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     )
     if args.json is not None:
         Path(args.json).write_text(json.dumps(replay.as_json(), indent=1) + "\n", encoding="utf-8")
-    if replay.verdict is None or replay.stopped:
+    if args.verify and replay.stopped:
+        raise ReviewError(_unfinished(replay))
+    if replay.verdict is None:
         return
     if replay.verdict.compared == 0 and replay.verdict.first is None:
         raise ReviewError("no step could be compared")
     if not replay.passed:
         raise ReviewError(replay.verdict.told)
     print(replay.verdict.told)
+
+
+def _unfinished(replay: Replay) -> str:
+    """What is to be said of a verification that was stopped."""
+    verdict = replay.verdict
+    steps = verdict.compared if verdict is not None else 0
+    differs = f" (it {verdict.told})" if verdict is not None and verdict.first is not None else ""
+    return f"stopped after {steps} steps were compared{differs}; the rest was not, so the recording is not verified"

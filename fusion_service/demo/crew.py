@@ -93,6 +93,11 @@ def client_arguments(command: Sequence[str], endpoint: str, speed: float, begin:
     return ["sensor_clients", *command, "--connect", endpoint, "--speed", str(speed), "--start-at", f"{begin:.3f}"]
 
 
-def record_arguments(out: str | Path, endpoint: str, cutoff: float) -> list[str]:
-    """What starts the recorder; cutoff: largest error that still counts as followed, m."""
-    return ["fusion_service", "record", "--out", str(out), "--connect", endpoint, "--cutoff", str(cutoff)]
+def record_arguments(
+    out: str | Path, endpoint: str, cutoff: float, every: float | None = None, live: str | None = None
+) -> list[str]:
+    """What starts the recorder; cutoff: largest error that still counts as followed, m; every: s between scored times,
+    None for each step; live: HOST:PORT, where viewers may look on."""
+    command = ["fusion_service", "record", "--out", str(out), "--connect", endpoint, "--cutoff", str(cutoff)]
+    command += ["--every", str(every)] if every else []
+    return [*command, "--live", live] if live else command

@@ -16,6 +16,7 @@ from fusion_service.config.settings import change, merge
 from fusion_service.config.toml_text import dotted, toml_value
 from fusion_service.demo.crew import Crew, DemoError, client_arguments, free_endpoint, record_arguments
 from fusion_service.demo.missions import MissionPlan, plan_mission, with_faults
+from fusion_service.demo.viewer import look_on
 from fusion_service.progress import Progress
 from schemas import GlobalTracks, MessageError, Wholes, decode, global_key, local_key
 
@@ -64,10 +65,12 @@ def run_demo(
     out: Path | None,
     json_path: Path | None,
     stop: threading.Event,
+    live: bool = False,
 ) -> dict[str, Any]:
     """Fly a mission and print its scores; returns what the JSON holds, nothing if it was stopped.
 
-    changes: settings of the centre as KEY=VALUE, above all others; faults: SOURCE:NAME=NUMBER,... of clients. Raises
+    live: show it in a viewer meanwhile. changes: settings of the centre as KEY=VALUE, above all others; faults:
+    SOURCE:NAME=NUMBER,... of clients. Raises
     `UsageError`, `ConfigError` or `DemoError` if it cannot be flown, before anything is written or started;
     `DemoError` and `BusError` if it goes wrong.
     """
@@ -95,7 +98,7 @@ def run_demo(
         f"few to begin and end; into {folder}",
         flush=True,
     )
-    _fly(plan, folder, config, recording, endpoint, speed, stop)
+    _fly(plan, folder, config, recording, endpoint, speed, stop, live)
     if stop.is_set():
         print(f"stopped; the recording so far: {recording}")
         return {}
@@ -124,7 +127,14 @@ def _toml_table(name: str, table: Mapping[str, Any]) -> str:
 
 
 def _fly(
-    plan: MissionPlan, folder: Path, config: Path, recording: Path, endpoint: str, speed: float, stop: threading.Event
+    plan: MissionPlan,
+    folder: Path,
+    config: Path,
+    recording: Path,
+    endpoint: str,
+    speed: float,
+    stop: threading.Event,
+    live: bool = False,
 ) -> None:
     from fusion_service.bus import open_bus
 
@@ -137,9 +147,12 @@ def _fly(
         bus.watch(local_key("*", "alive"), watch.on_token)
         bus.subscribe(global_key("*", "tracks"), watch.on_tracks)
         crew.start("service", ["fusion_service", "run", "--config", str(config)])
-        crew.start("record", record_arguments(recording, endpoint, plan.cutoff))
+        shown = free_endpoint().removeprefix("tcp/") if live else None
+        crew.start("record", record_arguments(recording, endpoint, plan.cutoff, plan.every, shown))
         token = global_key(load_config(config).centre.name, "alive")
         _wait(lambda: recording.exists() and token in watch.tokens, crew, stop)
+        if shown:
+            print(look_on(f"rerun+http://{shown}/proxy"), flush=True)
         begin = time.time() + START
         for name, command in plan.clients.items():
             crew.start(name, client_arguments(command, endpoint, speed, begin))

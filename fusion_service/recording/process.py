@@ -54,6 +54,7 @@ def run_recorder(
     stop: threading.Event,
     frame: Frame | None = None,
     cutoff: float | None = None,
+    every: float | None = None,
     trail: float = 300.0,
     draw: bool = True,
     rotation: Rotation | None = None,
@@ -80,7 +81,7 @@ def run_recorder(
     ]
     try:
         path = path or default_path(suffix=".rrd" if rotation is None else "")
-        how: dict[str, Any] = {"rotation": rotation, "live": live, "signer": signer}
+        how: dict[str, Any] = {"rotation": rotation, "live": live, "signer": signer, "every": every}
         with Recorder(path, realm=realm, frame=frame, cutoff=cutoff, trail=trail, draw=draw, **how) as recorder:
             log.info("recording %s/v1/** into %s", realm, path)
             dropped = _loop(inbox, recorder, stop, interval, on_tick or (lambda recorder: None))

@@ -34,6 +34,7 @@ from fusion_service.recording.drawing.scene import MAX_SOURCES, PATIENCE, Scene
 from fusion_service.recording.parts import Folder, Rotation, begin, is_folder, number_of, parts
 from fusion_service.recording.reader import recording_id
 from fusion_service.recording.repair import mend
+from fusion_service.recording.scoring import Scoring, write_scoring
 from fusion_service.recording.sealing import Sealer, last_link
 from schemas import REALM, Frame, Message, MessageError, SensorInfo, check_realm, decode, parse_key
 
@@ -69,6 +70,7 @@ class Recorder:
     with /), or any name with `rotation`; parts that are there stay, and are gone on from. `OSError` if it cannot be
     made. frame: draw in this frame; None takes that of the first global tracks, or of the first other message if none
     come in the first seconds. cutoff: of the assignment of tracks to true objects, m; None chooses one for each step.
+    every: s between scored times. Both are kept in the recording, for `evaluate`.
     trail: seconds of each trail that are seen at first. draw: False records the messages alone. focus: the id of a
     global track; the recording opens on this one alone, with its series. live: shown the same picture; closed with
     the recorder. signer: signs the chain of hashes.
@@ -81,6 +83,7 @@ class Recorder:
         realm: str = REALM,
         frame: Frame | None = None,
         cutoff: float | None = None,
+        every: float | None = None,
         trail: float = 300.0,
         draw: bool = True,
         rotation: Rotation | None = None,
@@ -95,6 +98,7 @@ class Recorder:
         self.bytes = 0
         self.undecodable: Counter[str] = Counter()
         self.missing = 0
+        self._scoring = Scoring(cutoff, every)
         self._prefix = f"{check_realm(realm)}/v1/"
         self._trail = trail
         self._draw = draw
@@ -165,7 +169,7 @@ class Recorder:
         except MessageError as error:
             self.undecodable[error.reason] += 1
             self._bad[key, error.reason] += 1
-        at = self._scene.mission_time(message)
+        at = self._scene.mission_time(message, received)
         path = entity("raw", *key.removeprefix(self._prefix).split("/"))
         self._raw.add(path, raw, Stamp(received, at, self._arrival), (key, data))
         self._sealer.add(key, data, received)
@@ -268,6 +272,7 @@ class Recorder:
         stream.send_recording_name(self.path.stem if self._folder is None else self.path.parent.name)
         part = (number_of(self.path) or 0) if self._folder is not None else 0
         stream.send_property("part", rr.AnyValues(number=number_of(self.path) or 0, begins=begins))
+        write_scoring(stream, self._scoring)
         self._stream = stream
         self._sealer.begin(stream, self._id, part)
 
@@ -354,7 +359,7 @@ class Recorder:
         frame = drawing.chart.frame if drawing.chart else None
         seen: dict[str, Any] = {"trails": drawing.trails, "trail": self._trail, "centres": sorted(drawing.centres)}
         if self._focus is None:
-            return blueprint(
-                frame, drawing.bounds, crowded=self._scene.crowded, supervised=self._scene.supervised, **seen
-            )
+            scene = self._scene
+            seen |= {"crowded": scene.crowded, "supervised": scene.supervised, "assessed": scene.assessed}
+            return blueprint(frame, drawing.bounds, **seen)
         return track_blueprint(frame, drawing.bounds, drawing.label(self._focus), reach=drawing.reach, **seen)

@@ -20,6 +20,7 @@ from fusion_service.arrays import Floats
 from fusion_service.colours import PAPER_FUSED, PAPER_TRUTH, source_colours
 from fusion_service.geodesy import FrameError, ecef_to_geodetic, transform
 from fusion_service.recording.drawing.geometry import QUANTILE, circle, outline
+from fusion_service.review.map_labels import MapLabel, place_labels
 from fusion_service.review.snapshots import in_frame, order, truth_path, truth_positions
 from schemas import Ecef, Enu, Frame, GlobalTracks, LocalTracks, Message, SensorInfo, Truth, check_numbers
 from schemas.messages import TENTATIVE
@@ -58,10 +59,7 @@ def mission_map(
     axes = figure.add_subplot(grid[:, 0])
     for name, info in mission.infos.items():
         _draw_sensor(axes, name, info, mission, metres)
-    _name_sensors(axes, mission, metres, float(max(high - low)))
     _draw_tracks(axes, mission, metres, _spread_out(mission.fused, ellipses), scale)
-    for target, (_, xy) in mission.truth.items() if len(mission.truth) <= MAX_LABELS else ():
-        axes.annotate(str(target), xy[0] / metres, (4, 4), textcoords="offset points", size=8, color="#555555")
     axes.set(xlim=(low[0] / metres, high[0] / metres), ylim=(low[1] / metres, high[1] / metres), aspect="equal")
     axes.set(xlabel=f"east, {unit}", ylabel=f"north, {unit}")
     axes.set_title(title, loc="left", weight="bold")
@@ -72,6 +70,7 @@ def mission_map(
     legend.legend(handles=handles, loc="upper left", frameon=False, fontsize=9, title=hidden, title_fontsize=8)
     for row, target in enumerate(_followed(mission)[:2] if scale > 1 else (), start=1):
         _draw_detail(figure.add_subplot(grid[row, 1]), mission, target)
+    place_labels(figure, axes, _names(mission, metres, float(max(high - low))))
     figure.savefig(path, format="png")
     return Path(path)
 
@@ -238,8 +237,8 @@ def _draw_sensor(axes: Axes, name: str, info: SensorInfo, mission: _Mission, met
     axes.plot(*place, "^", color=colour, ms=10, mec="black", mew=0.8, zorder=6)
 
 
-def _name_sensors(axes: Axes, mission: _Mission, metres: float, width: float) -> None:
-    """The names of sensors that stand together, within a hundredth of the map's width, on one line."""
+def _names(mission: _Mission, metres: float, width: float) -> list[MapLabel]:
+    """Of sensors, of those that stand together, within a hundredth of the map's width, on one line; then of targets."""
     together: list[tuple[Floats, list[str]]] = []
     for name, (place,) in mission.sensors.items():
         near = (names for at, names in together if math.dist(at, place) < width / 100)
@@ -248,9 +247,10 @@ def _name_sensors(axes: Axes, mission: _Mission, metres: float, width: float) ->
             together.append((place, [name]))
         else:
             names.append(name)
-    for at, names in together:
-        where = (at[0] / metres, at[1] / metres)
-        axes.annotate(", ".join(names), where, (0, -15), textcoords="offset points", ha="center", size=9, zorder=6)
+    labels = [MapLabel(at / metres, ", ".join(names), 9, "black", under=True) for at, names in together]
+    if len(mission.truth) <= MAX_LABELS:
+        labels += [MapLabel(xy[0] / metres, str(target)) for target, (_, xy) in mission.truth.items()]
+    return labels
 
 
 def _draw_tracks(axes: Axes, mission: _Mission, metres: float, when: set[int] | None, scale: float) -> None:

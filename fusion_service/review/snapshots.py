@@ -297,6 +297,9 @@ def in_frame(
         parts = [moments(m.means, m.covariances, m.weights, m.counts) for m in (messages[index] for index in indices)]
         means, covariances = (np.concatenate(column) for column in zip(*parts, strict=True))
         height = one.height if isinstance(one, LocalTracks) else None
+        if not len(means):  # what says nothing needs no frame
+            yield one.space, indices, means, covariances
+            continue
         yield one.space, indices, *transform(means, covariances, one.space, one.frame, frame, height)
 
 

@@ -258,7 +258,7 @@ def test_what_cannot_be_evaluated_is_told_in_one_line(
         ([empty], "holds no tracks"),
         ([flown, "--centre", "other"], "has no centre 'other'; there are: main"),
         ([flown, "--truth", tmp_path / "gone.csv"], "no truth at"),
-        ([flown, "--truth", table], "not a table of tracks"),
+        ([flown, "--truth", table], "line 1: column time is missing (there are: a, b)"),
         ([flown, "--truth", short], "a row of truth is not as it must be"),
         ([flown, "--truth", none], "holds no truth"),
         ([flown, "--truth", no], "is not a recording"),

@@ -49,9 +49,16 @@ def processes_with(text: str) -> list[int]:
     return found
 
 
-def test_three_radars_from_start_to_score(tmp_path: Path) -> None:
+def test_three_radars_from_start_to_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     out, scores = tmp_path / "out", tmp_path / "scores.json"
-    with Program(COMMAND, "demo", "--speed", "30", "--out", str(out), "--json", str(scores)) as program:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    arguments = ("--speed", "30", "--live", "--out", str(out), "--json", str(scores))
+    with Program(COMMAND, "demo", *arguments) as program:
+        assert program.line(60).startswith("three-radars: 300 s")
+        line = program.line(60)
+        assert line.startswith("look on: rerun --connect rerun+http://127.0.0.1:")
+        assert "no screen here" in line
         code, errors = program.end(timeout=90.0)
     assert code == 0, errors
     assert processes_with(str(tmp_path)) == []
@@ -72,6 +79,12 @@ def test_three_radars_from_start_to_score(tmp_path: Path) -> None:
     logs = [message for message in recorded if isinstance(message, StepLog)]
     assert len(pictures) == len(logs) == 31
     assert any(isinstance(message, Truth) for message in recorded)
+    again = tmp_path / "again.json"
+    assert main(["evaluate", result["recording"], "--json", str(again)]) == 0
+    (row,) = json.loads(again.read_text())["rows"]
+    assert {name: row[name] for name in ("sources", "fused", "shared", "scored")} == {
+        name: result[name] for name in ("sources", "fused", "shared", "scored")
+    }
     pairs = fuse_again.again(load_config(out / "centre.toml").centre, recorded)
     assert len(pairs) == 31
     assert fuse_again.differing(pairs) == []

@@ -151,7 +151,7 @@ def test_what_is_not_there_is_told(mission: tuple[Path, list[Message]], tmp_path
         export(path, tmp_path / "c.csv", "c")
     with pytest.raises(ReviewError, match="no tracks of 'other'"):
         export(path, tmp_path / "c.csv", centre="other")
-    with pytest.raises(ReviewError, match=r"\.csv or a \.parquet"):
+    with pytest.raises(ReviewError, match=r"\.csv, \.parquet, \.geojson or \.kml"):
         export(path, tmp_path / "c.xlsx")
     (tmp_path / "there.csv").write_text("")
     with pytest.raises(FileExistsError, match="exists already"):

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from fusion_service.colours import PAPER_FUSED, PAPER_TRUTH, SOURCES, source_colours
 from fusion_service.geodesy import enu_to_geodetic, geodetic_to_ecef
+from fusion_service.review.map_labels import MapLabel, place_labels
 from fusion_service.review.mission_map import mission_map
 from schemas import Disk, Ecef, Enu, Local, Message, Polygon, Sector
 from tests.helpers.missions import FRAME, info, picture, tracks, truth
@@ -160,3 +161,20 @@ def test_nothing_to_draw(tmp_path: Path) -> None:
             mission_map(nothing, tmp_path / "map.png")
     assert not (tmp_path / "map.png").exists()
     assert isinstance(mission_map([truth(0, [1], [[1.0, 2.0]])], tmp_path / "map.png", frame=Enu(60.1, 10.0)), Path)
+
+
+def test_labels_do_not_cover_each_other_and_those_without_room_are_left_out() -> None:
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(4, 4), dpi=100, layout="constrained")
+    axes = figure.add_subplot()
+    axes.set(xlim=(0, 10), ylim=(0, 10))
+    spread = [MapLabel(np.array([k, k]), f"target {k}") for k in (2.0, 5.0, 8.0)]
+    heap = [MapLabel(np.array([5.0, 2.0]), f"ship {k}") for k in range(40)]
+    out = place_labels(figure, axes, [*spread, *heap])
+    figure.draw_without_rendering()
+    boxes = [text.get_window_extent() for text in axes.texts]
+    assert [text.get_text() for text in axes.texts][:3] == [label.text for label in spread]
+    assert len(boxes) == 43 - out
+    assert 4 <= len(boxes) - 3 <= 12
+    assert not any(one.overlaps(other) for k, one in enumerate(boxes) for other in boxes[:k])

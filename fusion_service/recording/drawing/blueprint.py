@@ -24,7 +24,6 @@ METRES_PER_PIXEL = 156543.034
 TIMES = ("time", "received")
 STACKED = 4
 """Centres whose charts are stacked; those of more stand in one view."""
-BACKGROUND = (16, 16, 18)
 
 
 def blueprint(
@@ -36,11 +35,13 @@ def blueprint(
     centres: Sequence[str] = (),
     crowded: bool = False,
     supervised: bool = False,
+    assessed: bool = True,
 ) -> Any:
     """The blueprint for a picture in `frame` within `bounds` (south-west, north-east; m), of whose `trails`
     (entities) the last `trail` seconds are seen. centres: whose global tracks it shows. crowded: there are too many
     targets or tracks for a legend; a series under the pointer says its name. supervised: there are series of how far
-    sources are trusted, and shifted."""
+    sources are trusted, and shifted. assessed: there are errors against a truth; without, what needs none comes
+    first."""
     rr = import_rerun()
     import rerun.blueprint as rrb
 
@@ -56,20 +57,22 @@ def blueprint(
         ]
         return rrb.Vertical(*views, name=name)
 
-    upper = [
-        charts("error", "Error per target (m)"),
-        charts("existence", "Existence", 1.05),
-        _chart(rr, rrb, "/counts", "Tracks"),
+    counts, existence = _chart(rr, rrb, "/counts", "Tracks"), charts("existence", "Existence", 1.05)
+    influence = charts("influence", "Influence (weights per source)", 1.05)
+    traffic = [
+        _chart(rr, rrb, "/rate", "Messages per s"),
+        _chart(rr, rrb, "/apart", "Sources apart (m)"),
+        _chart(rr, rrb, "/offset", "Delays (s)"),
     ]
-    lower = [
-        charts("nees", "NEES per target", 8.0),
-        _chart(rr, rrb, "/anees", "Mean NEES", 4.0),
-        charts("influence", "Influence (weights per source)", 1.05),
-    ]
+    if assessed:
+        upper = [charts("error", "Error per target (m)"), existence, counts]
+        lower = [charts("nees", "NEES per target", 8.0), _chart(rr, rrb, "/anees", "Mean NEES", 4.0), influence]
+    else:
+        upper, lower, traffic = [counts, traffic[0], existence], [traffic[1], traffic[2], influence], []
     watched = [
         _chart(rr, rrb, "/consistency", "Sources (1 is right)", 3.0),
         _chart(rr, rrb, "/clock", "Clocks (s)"),
-        rrb.Spatial2DView(origin="/registration", name="Registration (m)", background=BACKGROUND),
+        rrb.Spatial2DView(origin="/registration", name="Registration (m)"),
     ]
     pages = [rrb.TextDocumentView(origin=entity("health", one), name=f"Health: {one}") for one in centres]
     told = [_log(rrb, "/log", "Status log"), *(pages or [rrb.TextDocumentView(origin="/health", name="Health")])]
@@ -79,7 +82,7 @@ def blueprint(
         [
             rrb.Tabs(*upper, active_tab=0),
             rrb.Tabs(*lower, active_tab=0),
-            rrb.Tabs(*told, *(watched if supervised else []), active_tab=0),
+            rrb.Tabs(*told, *(watched if supervised else []), *traffic, active_tab=0),
         ],
     )
 
@@ -116,7 +119,6 @@ def track_blueprint(
         origin="/near",
         name=f"Seen from track {track}: its sources in their colours, the truth grey",
         visual_bounds=rrb.VisualBounds2D(x_range=(-reach, reach), y_range=(-reach, reach)),
-        background=BACKGROUND,
     )
     left = rrb.Vertical(rrb.Tabs(*pictures, active_tab=0), along)
     return _whole(rrb, left, [*series, rrb.Tabs(*told, active_tab=0)])
@@ -156,7 +158,6 @@ def _pictures(
             name=name,
             overrides=history,
             visual_bounds=sight,
-            background=BACKGROUND,
         )
 
     views = [plane("Local picture (east right, north up)", ["/picture/**", "/grid/**"])]

@@ -26,6 +26,7 @@ from fusion_service.colours import (
     SCREEN_TRUTH,
     SCREEN_WARNING,
     Colour,
+    marker_of,
     series_colour,
     shade,
 )
@@ -64,6 +65,11 @@ class Charts:
     def crowded(self) -> bool:
         """Whether a legend would hide more than it tells."""
         return max(len(self._targets), *(len(known) for known in self._series.values()), 0) > LEGIBLE
+
+    @property
+    def assessed(self) -> bool:
+        """Whether anything was compared with a truth."""
+        return bool(self._targets)
 
     def restart(self) -> None:
         """A new part of the recording begins: every series says its style again."""
@@ -197,6 +203,8 @@ class Charts:
         if self._styles.get(path) != style:
             self._styles[path] = style
             self._columns.static(path, self._rr.SeriesLines(colors=[colour], names=[name], widths=[width]), keep=False)
+            if (marker := marker_of(colour)) is not None:
+                self._columns.static(path, self._rr.SeriesPoints(colors=[colour], markers=[marker]), keep=False)
         self._columns.scalar(path, stamp, value)
 
 

@@ -12,7 +12,10 @@ from fusion_service.colours import SCREEN_GRID, SCREEN_TRUTH, packed
 from fusion_service.recording.columns import ColumnWriter, import_rerun
 from fusion_service.recording.drawing.geometry import grid
 
-__all__ = ["Corners", "Extent"]
+__all__ = ["FAINT", "Corners", "Extent"]
+
+FAINT = 70
+"""Opacity of its lines, of 255: seen on a dark view and on a light one."""
 
 Corners = tuple[Floats, Floats]
 """South-west and north-east (2,), m."""
@@ -49,7 +52,7 @@ class Extent:
         """The grid, with its labels along the edges through `corner` (2,)."""
         assert self.square is not None
         lines, labels = grid(*self.square)
-        rr, tone = self._rr, packed(SCREEN_GRID)
+        rr, tone = self._rr, packed(SCREEN_GRID, FAINT)
         plane = [line * (1, -1) for line in lines]
         self._columns.static("/grid", rr.LineStrips2D(plane, colors=[tone], radii=[-0.5], draw_order=1.0))
         places = [np.where(line[0] == line[1], line[0], corner) * (1, -1) for line in lines]

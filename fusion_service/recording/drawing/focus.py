@@ -22,7 +22,7 @@ from fusion_service.arrays import Floats
 from fusion_service.colours import SCREEN_GRID, SCREEN_NEUTRAL, SCREEN_TRUTH, Colour, packed
 from fusion_service.recording.columns import Stamp, entity, import_rerun
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
-from fusion_service.recording.drawing.extent import Corners
+from fusion_service.recording.drawing.extent import FAINT, Corners
 from fusion_service.recording.drawing.geometry import RING, rings, track_moments
 from fusion_service.recording.drawing.styles import Styles
 from fusion_service.recording.drawing.tables import Table, remember, tabulate
@@ -117,7 +117,7 @@ class FocusView:
 
     def _rings(self, reach: float) -> None:
         """Circles at round distances from the track, with their radii."""
-        rr, tone, text, static = self._rr, packed(SCREEN_GRID), packed(SCREEN_TRUTH), self._canvas.columns.static
+        rr, tone, text, static = self._rr, packed(SCREEN_GRID, FAINT), packed(SCREEN_TRUTH), self._canvas.columns.static
         radii, labels = rings(reach)
         circles = [radius * RING.T for radius in radii]
         static("/near/grid", rr.LineStrips2D(circles, colors=[tone], radii=[-0.5], draw_order=1.0))

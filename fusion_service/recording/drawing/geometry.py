@@ -28,6 +28,7 @@ __all__ = [
     "circle",
     "ellipses",
     "grid",
+    "level",
     "outline",
     "rings",
     "track_moments",
@@ -69,12 +70,13 @@ def track_moments(message: LocalTracks | GlobalTracks) -> tuple[Floats, Floats]:
 
 
 class Chart:
-    """The frame of the drawing. `frame` ECEF draws in ENU about `near`, a position (x, y, z) in ECEF, m."""
+    """The frame of the drawing. `frame` ECEF draws in ENU about `near`, a position (x, y, z) in ECEF, m. Raises
+    `geodesy.FrameError` where that has no vertical."""
 
     def __init__(self, frame: Frame, near: tuple[float, float, float] | None = None) -> None:
         if isinstance(frame, Ecef):
-            lat, lon, _ = geodesy.ecef_to_geodetic(*(near or (geodesy.A, 0.0, 0.0)))
-            frame = Enu(float(lat), float(lon))
+            there = level(*(near or (geodesy.A, 0.0, 0.0)))
+            frame = Enu(there.lat, there.lon)
         self.frame = frame
 
     def place(
@@ -130,14 +132,22 @@ def ellipses(place: Place, dashed: NDArray[np.bool_], corners: int = CORNERS) ->
     )
 
 
+def level(x: float, y: float, z: float) -> Enu:
+    """The ENU frame about a position in ECEF, m. Raises `geodesy.FrameError` where there is no vertical: near the
+    centre of the Earth."""
+    lat, lon, alt = (float(one) for one in geodesy.ecef_to_geodetic(x, y, z))
+    if not all(math.isfinite(one) for one in (lat, lon, alt)):
+        raise geodesy.FrameError(f"{x:g}, {y:g}, {z:g} in ECEF is no place on Earth")
+    return Enu(lat, lon, alt)
+
+
 def outline(info: SensorInfo) -> tuple[list[Floats], Frame]:
     """The edges of a sensor's field of view as (P, 2) strips of x, y in m, and the frame they are in."""
     frame, centre = info.frame, np.array(info.position[:2])
     if isinstance(info.coverage, Polygon):
         return [np.array([*info.coverage.points, info.coverage.points[0]])], frame
     if isinstance(frame, Ecef):
-        lat, lon, alt = geodesy.ecef_to_geodetic(*info.position)
-        frame, centre = Enu(float(lat), float(lon), float(alt)), np.zeros(2)
+        frame, centre = level(*info.position), np.zeros(2)
     return [centre + edge for edge in _edges(info.coverage)], frame
 
 

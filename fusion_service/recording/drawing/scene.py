@@ -15,8 +15,10 @@ from fusion_service.recording.columns import ColumnWriter, Stamp
 from fusion_service.recording.drawing.charts import Charts
 from fusion_service.recording.drawing.errors import TruthMatcher
 from fusion_service.recording.drawing.log import EventLog
+from fusion_service.recording.drawing.mission_clock import MissionClock
 from fusion_service.recording.drawing.sources import SourceCharts
 from fusion_service.recording.drawing.tracks import Drawing
+from fusion_service.recording.drawing.traffic import TrafficCharts
 from schemas import (
     FAULTS,
     Frame,
@@ -38,8 +40,7 @@ log = logging.getLogger(__name__)
 
 PATIENCE = 5.0
 """Seconds for which the drawing waits for global tracks, to take their frame."""
-AHEAD = 3600 * 10**9
-"""Nanoseconds by which a message may be ahead of the newest global one and still be on the mission's timeline."""
+NOT_OURS = "its time is not the mission's"
 MAX_SOURCES = 256
 MAX_CENTRES = 32
 MAX_TRACKS = 5000
@@ -65,16 +66,17 @@ class Scene:
         self.event_log = EventLog(columns, self.drawing, focus)
         self.crowded = False
         """Whether charts have so many series that a legend would hide them."""
-        self.now: int | None = None
         self.supervised = False
         """Whether a status said how sources are trusted, or shifted."""
-        self._start: int | None = None
         self.undrawn: Counter[str] = Counter()
         self._charts = Charts(columns, focus)
         self._sources = SourceCharts(columns)
+        self._traffic = TrafficCharts(columns)
+        self.assessed = False
+        """Whether there are errors against a truth."""
         self._matcher = TruthMatcher(cutoff)
         self._wholes = Wholes()
-        self._by_centre = False
+        self._clock = MissionClock()
         self._new: list[tuple[Message, Stamp]] = []
         self._said: set[tuple[str, str]] = set()
         self._names: dict[bool, set[str]] = {True: set(), False: set()}
@@ -83,29 +85,25 @@ class Scene:
         """A new part of the recording begins."""
         self._charts.restart()
         self._sources.restart()
+        self._traffic.restart()
         self.drawing.changed = True
 
-    def mission_time(self, message: Message | None) -> int | None:
-        """The time of `message` on the mission's timeline, None where it has none or is impossibly far ahead. That of
-        a status is the service's own until its first step, which may be years from a mission played back."""
-        at: int | None = getattr(message, "time", None)
-        if at is None or isinstance(message, Status):
-            return None
-        from_centre = isinstance(message, GlobalTracks | StepLog)
-        if self._by_centre and not from_centre and self.now is not None and at > self.now + AHEAD:
-            return None
-        if from_centre or not self._by_centre:
-            self._by_centre = from_centre
-            self.now = at if self.now is None or from_centre else max(self.now, at)
-            self._start = at if self._start is None else self._start
-        return at
+    @property
+    def now(self) -> int | None:
+        """The newest time of the mission, ns; None before any."""
+        return self._clock.now
+
+    def mission_time(self, message: Message | None, received: int) -> int | None:
+        """The time of `message` on the mission's timeline, None where it has none, or has none yet."""
+        return self._clock.place(message, received)
 
     def add(self, message: Message, stamp: Stamp) -> None:
         """Take a message for the next `draw`; without a mission time it is drawn at that of its arrival."""
-        if isinstance(message, LocalTracks | LocalIntensity | Truth) and stamp.time is None:
-            self._leave_out(message.source, "its time is far ahead", 1, stamp._replace(time=self.now))
-        else:
-            self._new.append((message, stamp if stamp.time is not None else stamp._replace(time=self.now)))
+        timed = isinstance(message, LocalTracks | LocalIntensity | Truth)
+        if timed and stamp.time is None and self._clock.decided:
+            self._leave_out(message.source, NOT_OURS, 1, stamp._replace(time=self.now))
+            return
+        self._new.append((message, stamp if timed or stamp.time is not None else stamp._replace(time=self.now)))
         if len(self._new) > MAX_WAITING and self.drawing.chart is None:
             self._new.pop(0)
             self._leave_out(message.source, "nothing has said a frame and a time yet", 1, stamp)
@@ -119,12 +117,13 @@ class Scene:
     def draw(self, patience: float = PATIENCE) -> None:
         """Add the rows of all that was taken; what needs a frame waits for it, at most `patience` seconds."""
         ready = self._open_chart(patience)
-        drawn = [item for item in self._new if ready or not _needs_chart(item[0])]
-        self._new = [item for item in self._new if not ready and _needs_chart(item[0])]
+        due = [self._is_due(*item, ready) for item in self._new]
+        drawn = self._timely([item for item, now in zip(self._new, due, strict=True) if now])
+        self._new = [item for item, now in zip(self._new, due, strict=True) if not now]
         tracks = [message for message, _ in drawn if isinstance(message, LocalTracks | LocalIntensity | GlobalTracks)]
         faults = dict(zip(map(id, tracks), check_numbers(tracks), strict=True))
         for message, stamp in drawn:
-            stamp = stamp if stamp.time is not None else stamp._replace(time=self._start)
+            stamp = stamp if stamp.time is not None else stamp._replace(time=self._clock.start)
             if reason := self._unfit(message):
                 self._leave_out(message.source, reason, 1, stamp)
                 continue
@@ -142,19 +141,48 @@ class Scene:
         self.drawing.colour_sources()
         if self.crowded != self._charts.crowded:
             self.crowded = self.drawing.changed = True
+        if self.assessed < self._charts.assessed:
+            self.assessed = self.drawing.changed = True
         if self.supervised != self._sources.seen:
             self.supervised = self.drawing.changed = True
 
+    def _is_due(self, message: Message, stamp: Stamp, ready: bool) -> bool:
+        """Whether it can be drawn now; ready: the frame is known, and a mission time."""
+        if stamp.time is None and isinstance(message, LocalTracks | LocalIntensity | Truth):
+            return ready and self._clock.decided
+        return ready or not _needs_chart(message)
+
+    def _timely(self, items: list[tuple[Message, Stamp]]) -> list[tuple[Message, Stamp]]:
+        """Those that are on the mission's timeline, at their time; the others are left out, and said."""
+        found: list[tuple[Message, Stamp]] = []
+        for message, stamp in items:
+            if not isinstance(message, LocalTracks | LocalIntensity | Truth):
+                found.append((message, stamp))
+            elif (at := self._clock.judge(message) if stamp.time is None else stamp.time) is not None:
+                found.append((message, stamp._replace(time=at)))
+            else:
+                self._leave_out(message.source, NOT_OURS, 1, stamp._replace(time=self.now))
+        return found
+
     def _open_chart(self, patience: float) -> bool:
         """Whether the frame of the drawing, and a mission time, are known; takes the frame if it is time to."""
+        waited = bool(self._new) and self._new[-1][1].received - self._new[0][1].received >= patience * 1e9
+        if waited:
+            self._clock.settle(message for message, _ in self._new)
         if self.drawing.chart is None and self._new:
             messages = [message for message, _ in self._new]
             best: list[Drawable] = [m for m in messages if isinstance(m, GlobalTracks) and len(m.ids)]
-            if not best and self._new[-1][1].received - self._new[0][1].received >= patience * 1e9:
+            if not best and waited:
                 best = [m for m in messages if isinstance(m, LocalTracks | LocalIntensity | Truth)]
                 best += [m for m in messages if isinstance(m, SensorInfo)]
-            if best:
-                self.drawing.open_chart(best[0])
+            for message in best:
+                try:
+                    self.drawing.open_chart(message)
+                    break
+                except geodesy.FrameError as error:
+                    ours = [item for item in self._new if item[0] is message]
+                    self._new = [item for item in self._new if item[0] is not message]
+                    self._leave_out(message.source, str(error), len(ours), ours[0][1])
         return self.drawing.chart is not None and self.now is not None
 
     def _unfit(self, message: Message) -> str:
@@ -182,6 +210,7 @@ class Scene:
                 drawing.clear(source, stamp)
             if stamp.time is not None:
                 self._sources.status(message, drawing.colours, stamp)
+                self._traffic.status(message, drawing.colours, stamp)
         elif isinstance(message, StepLog):
             event_log.step(message, stamp)
         elif isinstance(message, SensorInfo):
@@ -201,6 +230,7 @@ class Scene:
                 self._matcher.step(message, stamp)
             if drawing.chart is not None:
                 self._too_many(message, "components", drawing.global_tracks(message, sound, stamp), stamp)
+                self._traffic.step(message, drawing.chart, stamp)
             unseen = charts.step(message, drawing.colours, drawing.centres, drawing.label, stamp)
             self._too_many(message, "series of existence", unseen, stamp)
         else:
@@ -210,6 +240,7 @@ class Scene:
                 over = drawing.intensity(message, sound, stamp)
             self._too_many(message, "components", over, stamp)
             charts.local(message, drawing.colours, stamp)
+            self._traffic.heard(message, drawing.colours, stamp)
 
     def _too_many(self, message: Message, what: str, count: int, stamp: Stamp) -> None:
         if count:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion_service.colours import SCREEN_NEUTRAL, Colour, shade
+from fusion_service.colours import SCREEN_NEUTRAL, Colour, marker_of, shade
 from fusion_service.recording.columns import ColumnWriter, Lines, Points, Stamp, entity, import_rerun
 from fusion_service.source_words import MOST_SIGMAS, Bias, biases, consistency
 from schemas import Status
@@ -89,4 +89,6 @@ class SourceCharts:
     def _series(self, path: str, stamp: Stamp, value: float, tone: Colour, name: str) -> None:
         if self._style(path, tone, name):
             self._columns.static(path, self._rr.SeriesLines(colors=[tone], names=[name], widths=[1.5]), keep=False)
+            if (marker := marker_of(tone)) is not None:
+                self._columns.static(path, self._rr.SeriesPoints(colors=[tone], markers=[marker]), keep=False)
         self._columns.scalar(path, stamp, value)

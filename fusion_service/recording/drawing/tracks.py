@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Floats
 from fusion_service.colours import SCREEN_NEUTRAL, SCREEN_TRUTH, Colour, centre_colours, screen_source_colours
 from fusion_service.coverage import at_platform
+from fusion_service.geodesy import FrameError
 from fusion_service.recording.columns import ColumnWriter, Stamp, entity
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
 from fusion_service.recording.drawing.extent import Corners, Extent
@@ -106,9 +107,11 @@ class Drawing:
         self._source(info.source)
         path, canvas = entity("picture", "sensors", info.source), self._canvas
         place = canvas.placing.place(np.array([info.position]), np.zeros((1, 3, 3)), ("x", "y", "z"), info.frame)
+        edges, frame = outline(info)
+        if not np.isfinite(place.xy).all():
+            raise FrameError("its sensor has no place on Earth")
         self._grow(place.xy, main=True)
         canvas.points(path, place, [info.source], stamp)
-        edges, frame = outline(info)
         moved = [canvas.placing.place(edge, np.zeros((len(edge), 2, 2)), ("x", "y"), frame) for edge in edges]
         xy = np.concatenate([np.zeros((0, 2)), *(part.xy for part in moved)])
         z = np.concatenate([np.zeros(0), *(part.z for part in moved)])

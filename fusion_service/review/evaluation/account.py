@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from fusion_service.review.evaluation.source_record import SourceRecords
+from fusion_service.review.evaluation.turned_away import TurnedAway
 from fusion_service.ways import fused_by
 from schemas import GlobalTracks, Status, StepLog
 from schemas.messages import BROKEN, CONFIRMED, GATE_FAILED, KEPT
@@ -24,7 +25,7 @@ class Account:
     tracks by number of their sources. ended: reason -> tracks. refused, dropped: (source, reason, "messages" or
     "tracks") -> how many. kept, failed, broken: source -> links that agreed, did not, were cut; innovation: source ->
     (n, sum of d2) of a link against the fusion of the other sources. dimension: of that d2, 0 without pictures.
-    status: the newest, None without. sources: what it said of them.
+    status: the newest, None without. sources: what it said of them. turned_away: what it did not take, and when.
     """
 
     rules: Counter[str] = field(default_factory=Counter)
@@ -44,6 +45,7 @@ class Account:
     innovation: dict[str, tuple[int, float]] = field(default_factory=dict)
     status: Status | None = None
     sources: SourceRecords = field(default_factory=SourceRecords)
+    turned_away: TurnedAway = field(default_factory=TurnedAway)
 
     def picture(self, message: GlobalTracks) -> None:
         """Enter a picture; of one that is a delta, not what it shows of the tracks that changed."""
@@ -63,6 +65,7 @@ class Account:
         """Enter a step log."""
         self.steps += 1
         self.sources.log(message)
+        self.turned_away.log(message)
         self.runs.add(message.epoch)
         for event in message.events:
             if event.get("kind") == "tracklets":

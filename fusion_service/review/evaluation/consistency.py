@@ -23,7 +23,7 @@ from fusion_service.metrics import nees, nees_bounds
 from fusion_service.review.snapshots import Block, Numbers
 from schemas import GlobalTracks
 
-__all__ = ["Consistency", "SourceAgreement", "SourcePair"]
+__all__ = ["Consistency", "SourceAgreement", "SourcePair", "links_by_source"]
 
 
 class SourcePair(NamedTuple):
@@ -80,22 +80,9 @@ class Consistency:
     def _links(
         self, picture: GlobalTracks, local: Mapping[str, tuple[Numbers, Block]]
     ) -> dict[str, tuple[NDArray[np.intp], NDArray[np.intp]]]:
-        """By source: rows of the picture's tracks and the numbers of the local tracks in them."""
+        """As `links_by_source`, once for each picture."""
         if self._of[0] is not picture:
-            counts = picture.contributor_counts.astype(np.intp)
-            owner = np.repeat(np.arange(len(picture.ids)), counts)
-            links = {}
-            for index, name in enumerate(picture.sources):
-                mine = np.flatnonzero(picture.contributor_source == index)
-                if name not in local or not len(mine):
-                    continue
-                number = np.full(len(mine), -1)
-                epochs = picture.contributor_epoch[mine]
-                for epoch in np.unique(epochs).tolist():
-                    some = epochs == epoch
-                    number[some] = local[name][0].find(epoch, picture.contributor_id[mine[some]])
-                links[name] = owner[mine], number
-            self._of = picture, links
+            self._of = picture, links_by_source(picture, {name: numbers for name, (numbers, _) in local.items()})
         return self._of[1]
 
     def result(self) -> SourceAgreement:
@@ -108,3 +95,24 @@ class Consistency:
                 for pair, (n, total) in self._sums.items()
             },
         )
+
+
+def links_by_source(
+    picture: GlobalTracks, numbers: Mapping[str, Numbers]
+) -> dict[str, tuple[NDArray[np.intp], NDArray[np.intp]]]:
+    """By source: rows of the picture's tracks and the numbers of the local tracks in them, -1 for one that is not
+    known."""
+    counts = picture.contributor_counts.astype(np.intp)
+    owner = np.repeat(np.arange(len(picture.ids)), counts)
+    links = {}
+    for index, name in enumerate(picture.sources):
+        mine = np.flatnonzero(picture.contributor_source == index)
+        if name not in numbers or not len(mine):
+            continue
+        number = np.full(len(mine), -1)
+        epochs = picture.contributor_epoch[mine]
+        for epoch in np.unique(epochs).tolist():
+            some = epochs == epoch
+            number[some] = numbers[name].find(epoch, picture.contributor_id[mine[some]])
+        links[name] = owner[mine], number
+    return links

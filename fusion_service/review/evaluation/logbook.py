@@ -12,19 +12,23 @@ from array import array
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.geodesy import FrameError, transform
+from fusion_service.recording.drawing.labels import Labels
 from fusion_service.review.evaluation.account import Account
 from fusion_service.review.evaluation.latency import Delays, Latency
+from fusion_service.review.evaluation.misses import PlatformPath
 from fusion_service.review.evaluation.traffic import Traffic
 from fusion_service.review.snapshots import Times, TrackMessage
 from schemas import (
     UNKNOWN_SIGMA,
     Frame,
     GlobalTracks,
+    Local,
     LocalIntensity,
     LocalTracks,
     Message,
@@ -39,6 +43,10 @@ from schemas import (
 __all__ = ["Logbook"]
 
 
+NO_FRAME = Local("none")
+"""Of a centre's pictures before it knows a frame."""
+AROUND = 3600 * 10**9
+"""ns."""
 SHOWING_EVERY = 8
 """Messages between calls of `progress`."""
 
@@ -48,7 +56,8 @@ class Logbook:
 
     truths; infos: newest of each source; accounts: by centre; traffic: by ("local", "intensity" or "global", name);
     latency: by (kind, name); bad: messages that do not decode, by reason; counts: messages by type; flat: centres
-    with a track whose height nobody told.
+    with a track whose height nobody told; labels: of global tracks, as recordings show them; platforms: by source;
+    inputs: a digest of what the sources sent, in any order.
     """
 
     def __init__(self, messages: Iterable[Message] = ()) -> None:
@@ -62,6 +71,9 @@ class Logbook:
         self.origins: Counter[str] = Counter()
         self.first_pictures: dict[str, GlobalTracks] = {}
         self.flat: set[str] = set()
+        self.inputs = 0
+        self.labels = Labels()
+        self.platforms: dict[str, PlatformPath] = {}
         self.received: tuple[int, int] | None = None
         self.path: Path | None = None
         self._spaces: dict[str, set[tuple[tuple[str, ...], Frame]]] = {}
@@ -164,10 +176,16 @@ class Logbook:
 
     @property
     def span(self) -> tuple[int, int] | None:
-        """Mission time of the first and the last tracks or truth, ns."""
-        times = [one.first for one in self.traffic.values()] + [one.last for one in self.traffic.values()]
-        times += [truth.time for truth in self.truths]
-        return (min(times), max(times)) if times else None
+        """Mission time of the first and the last tracks or truth, ns; of a source's, where there is a centre or truth,
+        those within `AROUND` of theirs: one wrong clock does not make a mission begin in 1970."""
+        sure = [truth.time for truth in self.truths]
+        for (kind, _), one in self.traffic.items():
+            sure += [one.first, one.last] if kind == "global" else []
+        times = np.frombuffer(self._columns["time"], dtype=np.int64)
+        if sure:
+            times = times[(times >= min(sure) - AROUND) & (times <= max(sure) + AROUND)]
+        ends = [*sure, *([int(times.min()), int(times.max())] if len(times) else [])]
+        return (min(ends), max(ends)) if ends else None
 
     def _order(self, wanted: Callable[[str, str], bool]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Arrival numbers of what is wanted in the order of places, and as they came."""
@@ -214,6 +232,8 @@ class Logbook:
         self.traffic.setdefault((kind, name), Traffic()).tracks += size
         self.origins[message.origin] += 1
         self._delays.densities(message, received)
+        if not isinstance(message, GlobalTracks):
+            self.inputs = (self.inputs + crc32(message.means.tobytes(), message.time % 2**32)) % 2**64
 
     def _note_tracks(self, message: TrackMessage, arrival: int, received: int | None) -> None:
         kind, name = "local" if isinstance(message, LocalTracks) else "global", message.source
@@ -227,13 +247,18 @@ class Logbook:
             self._spreads[kind].append(typical)
         if isinstance(message, GlobalTracks):
             self._account(name).picture(message)
+            self.labels.see(message)
             if not told.all():
                 self.flat.add(name)
             first = self.first_pictures.setdefault(name, message)
-            if (message.time, message.epoch) < (first.time, first.epoch):
+            if _first(message) < _first(first):
                 self.first_pictures[name] = message
         else:
             self._spaces.setdefault(name, set()).add((message.space, message.frame))
+            if message.platform is not None:
+                path = self.platforms.setdefault(name, PlatformPath([], []))
+                path.times.append(message.time)
+                path.places.append((message.platform, message.frame))
 
     def _account(self, centre: str) -> Account:
         return self.accounts.setdefault(centre, Account())
@@ -247,5 +272,13 @@ class Logbook:
             period = info.period if info else None
             time, epoch, seq = (columns[one][mine] for one in ("time", "epoch", "seq"))
             self.traffic[kind, name].count(time, epoch, seq, period)
+        for name, path in self.platforms.items():
+            order = sorted(range(len(path.times)), key=path.times.__getitem__)
+            self.platforms[name] = PlatformPath([path.times[k] for k in order], [path.places[k] for k in order])
         self.latency = self._delays.result()
         self._delays = Delays()
+
+
+def _first(picture: GlobalTracks) -> tuple[bool, int, int]:
+    """Sorting key of pictures, those that name no frame last: what a centre says before it knows one."""
+    return picture.frame == NO_FRAME and not len(picture.ids), picture.time, picture.epoch

@@ -4,45 +4,46 @@ from __future__ import annotations
 
 import base64
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
-from itertools import combinations
 from pathlib import Path
-
-import numpy as np
 
 from fusion_service.errors import ReviewError
 from fusion_service.extras import install_hint
 from fusion_service.recording.drawing.labels import utc
 from fusion_service.review.evaluation.assess import Assessment, Evaluation
 from fusion_service.review.evaluation.hull_table import TITLE, hull_table
+from fusion_service.review.evaluation.report_tables import html_table, mark
 from fusion_service.review.evaluation.report_text import CSS, WORDS
-from fusion_service.review.evaluation.results import facts, label, rows_of, rule_of
+from fusion_service.review.evaluation.report_truthless import without_truth
+from fusion_service.review.evaluation.results import (
+    comparison_of,
+    facts,
+    label,
+    lead,
+    promises,
+    rows_of,
+    truthless_lead,
+)
 from fusion_service.review.evaluation.scoring import Scores
 from fusion_service.review.evaluation.source_record import MOST_SAID, SourceRecords, sources_table
 from fusion_service.review.evaluation.tables import (
-    DELAYS,
     NUMBERS,
     ScoredCentre,
     best_rows,
-    comparison,
     confirm_line,
     digits,
     fixed,
-    links,
-    pair_words,
-    percent,
     power_of_ten,
     row_name,
     rules_table,
-    sentence,
     tracking_table,
-    way_shares,
 )
-from fusion_service.ways import reason_words
+from fusion_service.review.evaluation.target_words import HEAD, LEFT, missed_summary, target_table
 
 __all__ = ["need_matplotlib", "report"]
 
+MOST_TARGETS = 200
 SCORES = (
     "",
     "RMSE, m",
@@ -72,20 +73,19 @@ def report(assessments: Sequence[Assessment]) -> str:
     rows = rows_of(assessments)
     title = ", ".join(dict.fromkeys(label(one) or "mission" for one in assessments))
     body = [f"<h1>Mission review: {escape(title)}</h1>"]
-    if rows:
-        body.append(f'<p class="lead">{escape(sentence(rows[0]) if len(rows) == 1 else comparison(rows))}</p>')
+    body += [f'<p class="lead">{escape(said)}</p>' for said in lead(assessments)]
     for one in assessments:
         if one.unscored:
-            text = f"{label(one) or 'The mission'}: {one.unscored}. What follows needs no truth."
+            text = f"{label(one) or 'The mission'}: {one.unscored}. {truthless_lead(one)} What follows needs no truth."
             body.append(f'<p class="lead">{escape(text)}</p>')
     body += [_facts(one) for one in assessments]
     if len(rows) > 1:
-        body += ["<h2>Rules beside each other</h2>", _rules(rows)]
+        body += ["<h2>Rules beside each other</h2>", _rules(rows, ranked=comparison_of(assessments).ranked)]
     body += _map(assessments[0])
     for one in assessments:
         if group := rows_of([one]):
             which = f": {escape(label(one))}" if len(assessments) > 1 else ""
-            body += [f"<h2>Against the truth{which}</h2>", *_against_truth(group)]
+            body += [f"<h2>Tracks against the truth{which}</h2>", *_against_truth(group), *_targets(group, one)]
     if rows:
         figures = [f"<figure>{svg}<figcaption>{escape(text)}</figcaption></figure>" for svg, text in charts(rows)]
         body += ["<h2>Over time</h2>", f'<div class="charts">{"".join(figures)}</div>']
@@ -94,7 +94,7 @@ def report(assessments: Sequence[Assessment]) -> str:
             of = f": {label(one) or name}" if len(assessments) + len(one.book.accounts) > 2 else ""
             body += _sources(one, account.sources, of)
     for one in assessments:
-        body += _without_truth(one, f": {label(one)}" if len(assessments) > 1 else "")
+        body += without_truth(one, f": {label(one)}" if len(assessments) > 1 else "")
     words = "".join(f"<dt>{escape(word)}</dt><dd>{escape(text)}</dd>" for word, text in WORDS.items())
     body += ["<h2>How to read the numbers</h2>", f'<dl class="words">{words}</dl>']
     head = (
@@ -118,35 +118,19 @@ def _facts(one: Assessment) -> str:
     return f'<dl class="facts">{lines}</dl>'
 
 
-def _table(
-    head: Sequence[str], lines: Iterable[Sequence[str]], marks: dict[tuple[int, int], str] | None = None, left: int = 1
-) -> str:
-    """marks: (row, column) -> class of the cell; a row that begins with "fused" stands out. The first `left` columns,
-    and one without a name, stand to the left."""
-    marks = marks or {}
-    parts = ["<tr>", *(f"<th{_left(k, left)}>{escape(cell)}</th>" for k, cell in enumerate(head)), "</tr>"]
-    for index, line in enumerate(lines):
-        parts.append('<tr class="fused">' if line and line[0].startswith("fused") else "<tr>")
-        for k, cell in enumerate(line):
-            mark = marks.get((index, k), "")
-            classes = " ".join(filter(None, (mark, "left" if 0 < k < left or (k and not head[k]) else "")))
-            parts.append(f'<td class="{classes}">' if classes else "<td>")
-            parts.append(f"{escape(cell)}</td>")
-        parts.append("</tr>")
-    return f'<div class="scroll"><table>{"".join(parts)}</table></div>'
-
-
-def _left(k: int, left: int) -> str:
-    return ' class="left"' if 0 < k < left else ""
-
-
-def _rules(rows: Sequence[ScoredCentre]) -> str:
+def _rules(rows: Sequence[ScoredCentre], *, ranked: bool) -> str:
     head, *lines = rules_table(rows)
-    best = best_rows(rows)
+    best = best_rows(rows) if ranked else {}
     marks = {(index, k): "best" for k, name in enumerate(head) for index in best.get(name, ())}
     text = "The best of each column is marked (ANEES: nearest to 1). GOSPA, OSPA, RMSE in m; 2+: targets that several"
-    note = f'<p class="note">{text} sources track.</p>'
-    return _table(head, lines, marks, left=len(head) - NUMBERS) + note
+    marked = f"{text} sources track." if ranked else "Not ranked: each row is of a mission of its own."
+    note = f'<p class="note">{marked} A rank is of this mission; what a rule promises holds in all.</p>'
+    said = promises(rows)
+    lines = [[*line, said[row.rule]] for line, row in zip(lines, rows, strict=True)]
+    return (
+        html_table([*head, "promise"], lines, marks, left=len(head) - NUMBERS, columns=[len(head)], wide=len(head))
+        + note
+    )
 
 
 def _map(one: Assessment) -> list[str]:
@@ -182,18 +166,39 @@ def _against_truth(rows: Sequence[ScoredCentre]) -> list[str]:
     )
     found = [f'<p class="note">{escape(about)}</p>', _scores(scored)]
     if hull := hull_table(scored):
-        found += ["<h3>Against the hulls</h3>", _table(hull[0], hull[1:]), f'<p class="note">{escape(TITLE)}.</p>']
+        found += ["<h3>Against the hulls</h3>", html_table(hull[0], hull[1:]), f'<p class="note">{escape(TITLE)}.</p>']
     found += [f"<p>Not scored: {escape(name)}: {escape(why)}</p>" for name, why in evaluation.left_out.items()]
     if evaluation.seen.max(initial=0) > 1 and fused:
         text = "On the same pairs of target and time. The best single source is found with the truth, for each target."
         found += ["<h3>What fusion gains: targets that several sources track</h3>", _gain(fused)]
         found.append(f'<p class="note">{text}</p>')
     names, *following = tracking_table(scored, len(evaluation.targets))
-    found += ["<h3>How well tracks hold on to targets</h3>", _table(names, following)]
+    found += ["<h3>How well tracks hold on to targets</h3>", html_table(names, following)]
     told: dict[str, list[str]] = {}
     for name, one in fused.items():
         told.setdefault(confirm_line(one), []).append(name)
     found += [f"<p>{escape(line + ('' if len(told) == 1 else ' ' + ', '.join(of)))}</p>" for line, of in told.items()]
+    return found
+
+
+def _targets(rows: Sequence[ScoredCentre], one: Assessment) -> list[str]:
+    """Each target of each row."""
+    found = []
+    for row in rows:
+        evaluation = row.evaluation
+        if evaluation.centre is None or not evaluation.records:
+            continue
+        of = f": {row_name(row, rows)}" if len(rows) > 1 else ""
+        found.append(f"<h3>Each target{escape(of)}</h3>")
+        summary, start = missed_summary(evaluation), int(evaluation.times[0])
+        found += [f"<p>{escape(summary)}</p>"] if summary else []
+        table = target_table(evaluation, start, one.book.labels, MOST_TARGETS)
+        order = [*range(3), len(HEAD) - 1, *range(3, len(HEAD) - 1)]
+        head, *lines = ([line[k] for k in order] for line in table)
+        found.append(html_table(head, lines, columns=[order.index(k) for k in LEFT], wide=3))
+        left = len(evaluation.records) - MOST_TARGETS
+        more = f" {left} more are in --json." if left > 0 else ""
+        found.append(f'<p class="note">The worst first; times in s from the first scored one.{more}</p>')
     return found
 
 
@@ -210,8 +215,8 @@ def _scores(scored: Mapping[str, Scores]) -> str:
         ]
         for name, one in scored.items()
     ]
-    return _table(
-        SCORES, lines, {(index, 6): _mark(one.anees, one.bounds) for index, one in enumerate(scored.values())}
+    return html_table(
+        SCORES, lines, {(index, 6): mark(one.anees, one.bounds) for index, one in enumerate(scored.values())}
     )
 
 
@@ -232,13 +237,7 @@ def _gain(fused: Mapping[str, Evaluation]) -> str:
         for kind, line in one.shared.items()
         if len(fused) == 1 or kind == "seen_by_2_or_more"
     ]
-    return _table(SHARED, lines)
-
-
-def _mark(value: float, bounds: tuple[float, float]) -> str:
-    """The class of a cell with a mean that lies within `bounds`, below or above; none without one."""
-    low, high = bounds
-    return "" if not np.isfinite(value) else "low" if value < low else "high" if value > high else "good"
+    return html_table(SHARED, lines)
 
 
 def _sources(one: Assessment, records: SourceRecords, of: str) -> list[str]:
@@ -250,7 +249,7 @@ def _sources(one: Assessment, records: SourceRecords, of: str) -> list[str]:
     if not table:
         return []
     head, *lines = table
-    found = [f"<h2>The sources{escape(of)}</h2>", _table(head, lines, left=2)]
+    found = [f"<h2>The sources{escape(of)}</h2>", html_table(head, lines, left=2)]
     found.append('<p class="note">At the end; ± one standard deviation. The charts show how it came to be.</p>')
     found += [f"<p>{escape(sentence)}</p>" for sentence in said]
     start = one.book.span[0] if one.book.span else 0
@@ -258,115 +257,8 @@ def _sources(one: Assessment, records: SourceRecords, of: str) -> list[str]:
     if events:
         rows = [[f"{(time - start) / 1e9:.1f}", name, text] for time, name, text in events[:MOST_SAID]]
         left = len(events) - len(rows) + sum(record.more for record in records.by_name.values())
-        found += ["<h3>What was said of them</h3>", _table(("s", "source", ""), rows, left=3)]
+        found += ["<h3>What was said of them</h3>", html_table(("s", "source", ""), rows, left=3)]
         found += [f'<p class="note">{left} more.</p>'] if left else []
     figures = source_charts(records, start, source_colours([*one.book.sources, *one.book.infos]))
     shown = [f"<figure>{svg}<figcaption>{escape(text)}</figcaption></figure>" for svg, text in figures]
     return [*found, f'<div class="charts">{"".join(shown)}</div>'] if shown else found
-
-
-def _without_truth(one: Assessment, which: str) -> list[str]:
-    from fusion_service.colours import source_colours
-    from fusion_service.review.evaluation.report_charts import delay_chart
-
-    book = one.book
-    colours = source_colours([*book.sources, *book.infos])
-    found = [f"<h2>Without any truth{escape(which)}</h2>"]
-    for name, agreement in list(one.agreements.items())[:1]:
-        if any(pair.n for pair in agreement.pairs.values()):
-            found += ["<h3>Sources against each other</h3>", _matrix(one, name)]
-    for name, account in book.accounts.items():
-        of = f" ({name}: {rule_of(one, name)})" if len(book.accounts) > 1 else ""
-        shown = sum(account.shown.values())
-        if shown:
-            parts = [(str(n) if n else "none, coasting", count) for n, count in sorted(account.shown.items())]
-            found.append(f"<h3>How many sources feed a confirmed track{escape(of)}</h3>")
-            shares = [["share", *(percent(count / shown) for _, count in parts)]]
-            found.append(_table(["sources", *(n for n, _ in parts)], shares))
-        if ways := way_shares(account):
-            found.append(f"<h3>What confirmed tracks were fused by{escape(of)}</h3>")
-            found.append(_table(["", *(way for way, _ in ways)], [["share", *(share for _, share in ways)]]))
-        if reasons := [[name, reason_words(why)] for name, why in sorted(account.ungiven.items()) if why]:
-            found.append(_table(("no tracklets of", "because"), reasons, left=2))
-        if lines := links(account):
-            found.append(f"<h3>Links against the fusion of the others{escape(of)}</h3>")
-            found.append(_table(("", "kept", "failed a gate", "cut", "mean d² / n"), lines))
-        refusals = [
-            [verb, source or "several", reason, f"{count} {what}"]
-            for verb, counter in (("refused", account.refused), ("dropped", account.dropped))
-            for (source, reason, what), count in sorted(counter.items())
-        ]
-        found.append(f"<h3>Refused and dropped{escape(of)}</h3>")
-        found.append(
-            _table(("", "source", "reason", "how many"), refusals, left=3)
-            if refusals
-            else "<p>Nothing, by the step logs.</p>"
-            if account.steps
-            else "<p>No step logs were recorded.</p>"
-        )
-    found += ["<h3>Gaps</h3>", _gaps(one)]
-    delays = [(kind, {n: d for (k, n), d in book.latency.items() if k == kind}) for kind in DELAYS]
-    lines = [
-        [DELAYS[kind], name, str(delay.n), *(f"{1000 * value:.3g}" for value in delay[1:4])]
-        for kind, some in delays
-        for name, delay in sorted(some.items())
-    ]
-    if lines:
-        found += [
-            "<h3>Delays</h3>",
-            _table(("", "of", "messages", "median, ms", "95 %, ms", "largest, ms"), lines, left=2),
-        ]
-        figures = [
-            f"<figure>{delay_chart(some, colours, DELAYS[kind].capitalize())}</figure>" for kind, some in delays if some
-        ]
-        found.append(f'<div class="charts">{"".join(figures)}</div>')
-    return found
-
-
-def _matrix(one: Assessment, centre: str) -> str:
-    pairs = one.agreements[centre].pairs
-    names = sorted({name for pair in pairs for name in pair})
-    lines, marks, words = [], {}, []
-    for row, name in enumerate(names):
-        line = [name]
-        for column, other in enumerate(names):
-            pair = pairs.get((min(name, other), max(name, other)))
-            if name == other or pair is None or not pair.n:
-                line.append("·")
-                marks[row, column + 1] = "none"
-                continue
-            line.append(fixed(pair.mean))
-            marks[row, column + 1] = _mark(pair.mean, pair.bounds)
-        lines.append(line)
-    for a, b in combinations(names, 2):
-        pair = pairs[a, b]
-        if pair.n:
-            words.append([f"{a}, {b}", str(pair.n), fixed(pair.mean), fixed(*pair.bounds), pair_words(pair)])
-    key = (
-        '<p class="note">Mean of the squared distance of linked tracks over its dimension.'
-        '<span class="swatch" style="background:#dff2e8"></span>as the covariances say'
-        '<span class="swatch" style="background:#fbdcd0"></span>above: too small, biased, or wrong links'
-        '<span class="swatch" style="background:#dceaf6"></span>below: too large, or correlated errors</p>'
-    )
-    head = ("sources", "pairs", "mean", "95 % bounds", "")
-    detail = "" if len(words) > 15 else _table(head, words)
-    return _table(["", *names], lines, marks) + key + detail
-
-
-def _gaps(one: Assessment) -> str:
-    lines = []
-    for (kind, name), traffic in sorted(one.book.traffic.items(), reverse=True):
-        longest = traffic.silences[0] if traffic.silences else None
-        lines.append(
-            [
-                f"{name} (centre)" if kind == "global" else name,
-                str(traffic.messages),
-                f"{traffic.interval:.3g}",
-                str(traffic.epochs),
-                str(traffic.missing),
-                str(traffic.silent),
-                f"{(longest.end - longest.begin) / 1e9:.3g} s from {utc(longest.begin)}" if longest else "-",
-            ]
-        )
-    head = ("", "messages", "interval, s", "runs", "numbers missing", "silent spans", "longest silence")
-    return _table(head, lines)

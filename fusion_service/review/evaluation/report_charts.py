@@ -16,8 +16,9 @@ from fusion_service.colours import (
     PAPER_FUSED,
     PAPER_TRUTH,
     SKY,
-    SOURCES,
     VERMILION,
+    line_style,
+    paper_colour,
     source_colours,
 )
 from fusion_service.review.evaluation.figures import chart, legend, thin
@@ -113,7 +114,8 @@ def delay_chart(delays: dict[str, Latency], colours: dict[str, str], title: str)
             wide = 8 if delay.n < 64 else wide
             share = np.array(delay.counts).reshape(-1, wide).sum(axis=1) / delay.n
             edges = 1000 * np.array(delay.edges)[::wide]
-            axes.stairs(100 * share, edges, color=colours.get(name, PAPER_FUSED), label=name, lw=1.4)
+            tone = colours.get(name, PAPER_FUSED)
+            axes.stairs(100 * share, edges, color=tone, ls=line_style(tone), label=name, lw=1.4)
         axes.set(xlabel="delay, ms", ylabel="messages, %", ylim=(0, None))
         legend(axes)
 
@@ -134,11 +136,15 @@ def _lines(rows: Sequence[ScoredCentre]) -> list[Line]:
         if first.centre is None:
             return lines
         return [*lines, (f"fused, {rows[0].rule}", PAPER_FUSED, 2.0, first.fused, seconds)]
-    tones = (PAPER_FUSED, *SOURCES)
     return [
-        (row_name(row, rows), tones[k % len(tones)], 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
+        (row_name(row, rows), _tone(k), 1.5, row.evaluation.fused, _seconds(row.evaluation.times))
         for k, row in enumerate(rows)
     ]
+
+
+def _tone(k: int) -> str:
+    """Of the k-th row."""
+    return paper_colour(k - 1) if k else PAPER_FUSED
 
 
 def _seconds(times: NDArray[np.int64]) -> Floats:
@@ -161,7 +167,7 @@ def _over_time(axes: Axes, lines: Sequence[Line], what: str, unit: str) -> None:
         values = getattr(scores.series, what)
         if what == "ospa2":
             seconds = seconds[scores.series.windows]
-        axes.plot(*thin(seconds, values), color=colour, lw=width, label=name)
+        axes.plot(*thin(seconds, values), color=colour, lw=width, ls=line_style(colour), label=name)
     axes.set(xlabel="s since the first scored time", ylabel=unit, ylim=(0, None))
     legend(axes)
 
@@ -172,7 +178,7 @@ def _nees(axes: Axes, lines: Sequence[Line]) -> None:
     axes.fill_between(x, low, thin(seconds, fused.series.high)[1], color=GREEN, alpha=0.18, lw=0, label="95 %")
     axes.axhline(1.0, color=GREEN, lw=0.8)
     for name, colour, width, scores, at in lines:
-        axes.plot(*thin(at, scores.series.anees), color=colour, lw=width, label=name)
+        axes.plot(*thin(at, scores.series.anees), color=colour, lw=width, ls=line_style(colour), label=name)
     values = np.concatenate([scores.series.anees[np.isfinite(scores.series.anees)] for *_, scores, _ in lines])
     top = float(np.quantile(values, 0.99)) * 1.15 if len(values) else 2.0
     axes.set(xlabel="s since the first scored time", ylabel="NEES / dimension", ylim=(0, max(top, 2.0)))
@@ -189,7 +195,9 @@ def _cardinality(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
             axes.plot(*thin(seconds, first.fused.series.expected), "--", color=BLUE, lw=1.2, label="expected")
     else:
         for name, colour, width, scores, at in _lines(rows):
-            axes.plot(*thin(at, scores.series.shown.astype(float)), color=colour, lw=width, label=name)
+            axes.plot(
+                *thin(at, scores.series.shown.astype(float)), color=colour, lw=width, ls=line_style(colour), label=name
+            )
     axes.set(xlabel="s since the first scored time", ylabel="targets, tracks", ylim=(0, None))
     legend(axes)
 
@@ -207,7 +215,6 @@ def _siap(axes: Axes, row: ScoredCentre) -> None:
 
 
 def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
-    tones = (PAPER_FUSED, *SOURCES)
     for k, row in enumerate(rows):
         known = int((row.evaluation.begins >= 0).sum())
         after = np.sort(row.evaluation.confirm[np.isfinite(row.evaluation.confirm)])
@@ -215,7 +222,7 @@ def _confirm(axes: Axes, rows: Sequence[ScoredCentre]) -> None:
             continue
         x, y = np.append(after, after[-1] * 1.08 + 1), np.append(np.arange(1, len(after) + 1), len(after))
         label = row_name(row, rows) if len(rows) > 1 else None
-        axes.step([0, *x], [0, *(100 * y / known)], where="post", color=tones[k % len(tones)], label=label)
+        axes.step([0, *x], [0, *(100 * y / known)], where="post", color=_tone(k), ls=line_style(_tone(k)), label=label)
     axes.set(xlabel="s since it could be known", ylabel="targets confirmed, %", ylim=(0, 104), xlim=(0, None))
     if len(rows) > 1:
         legend(axes)

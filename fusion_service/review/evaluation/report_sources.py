@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fusion_service.colours import line_style
 from fusion_service.review.evaluation.figures import chart, legend
 from fusion_service.review.evaluation.source_record import SourceRecord, SourceRecords
 from fusion_service.source_words import MOST_SIGMAS, Bias
@@ -77,7 +78,7 @@ def _consistency(
         samples = known[name].samples
         at = _seconds([one.time for one in samples], start)
         tone = colours.get(name, "black")
-        axes.plot(at, [one.consistency for one in samples], color=tone, label=name)
+        axes.plot(at, [one.consistency for one in samples], color=tone, ls=line_style(tone), label=name)
         for bound in ([one.low for one in samples], [one.high for one in samples]):
             axes.plot(at, bound, color=tone, lw=0.7, ls="--")
     values = np.array([one.consistency for name in names for one in known[name].samples])
@@ -94,7 +95,7 @@ def _bias(some: dict[str, list[tuple[int, Bias]]], unit: str, start: int, colour
         reach = MOST_SIGMAS * np.array([one.sigma for _, one in there])
         tone = colours.get(name, "black")
         axes.fill_between(at, value - reach, value + reach, color=tone, alpha=0.15, lw=0)
-        axes.plot(at, value, color=tone, label=name)
+        axes.plot(at, value, color=tone, ls=line_style(tone), label=name)
     axes.axhline(0.0, color="#999999", lw=0.8)
     axes.set(xlabel="s of the mission", ylabel=unit)
     legend(axes)

@@ -22,6 +22,7 @@ table{border-collapse:collapse;font-size:.9rem;font-variant-numeric:tabular-nums
 th,td{padding:.28rem .7rem;text-align:right;border-bottom:1px solid #d9dee3;white-space:nowrap}
 th{font-weight:600;color:#40474e;border-bottom:2px solid #9aa3ab}
 th:first-child,td:first-child,td.left,th.left{text-align:left}
+td.wrap{white-space:normal;min-width:17rem}
 tr.fused td{font-weight:600}
 tr.fused td:not([class]){background:#f5f5f5}
 td.best{background:#dff2e8;font-weight:600}

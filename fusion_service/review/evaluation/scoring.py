@@ -131,6 +131,8 @@ class Tally:
         self._siap = np.zeros((count, 2), dtype=np.int64)
         self._expected = np.full(count, np.nan)
         self._errors, self._nees = np.full((2, count, targets), np.nan)
+        self.held = np.full((count, targets), -1, dtype=np.int32)
+        """(K, T): the number of the track that is assigned to each target, -1 without one."""
         self._last = np.full(targets, -1)
         self._switches = 0
         self._sums = np.zeros(4)
@@ -195,7 +197,7 @@ class Tally:
         self._parts[k] = squared, c**P / 2 * (objects - len(targets)), c**P / 2 * (shown - len(targets))
         self._ospa[k] = ((squared + c**P * (most - len(targets))) / most) ** (1 / P) if most else 0.0
         self._shown[k] = shown
-        self._errors[k, targets] = apart
+        self._errors[k, targets], self.held[k, targets] = apart, tracks
         offset = block.states[rows] - self._truth[k, targets]
         self._nees[k, targets] = nees(offset[:, :d], block.covariances[rows]) / d
         if self._hulls is not None:

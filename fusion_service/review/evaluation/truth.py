@@ -1,9 +1,11 @@
-"""Truth from a file of its own: a recording, or a table of tracks (CSV or Parquet) as `schemas.flat` describes it."""
+"""Truth from a file of its own: a recording, a table of tracks (CSV or Parquet) as `schemas.flat` describes it, or a
+plain table of fixes (`gps_table`)."""
 
 from __future__ import annotations
 
 import csv
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,19 +13,58 @@ import numpy as np
 
 from fusion_service.errors import ReviewError
 from fusion_service.extras import install_hint
+from fusion_service.review.evaluation.gps_table import GpsTable, is_gps_table, read_gps
+from fusion_service.review.evaluation.logbook import Logbook
 from schemas import MessageError, Truth, decode
 from schemas.flat import frame_of, space_of
 
-__all__ = ["read_truth"]
+__all__ = ["NO_TRUTH", "TruthFile", "read_truth"]
 
 FlatTable = dict[str, list[Any]]
 ROWS = 50_000
 
 
-def read_truth(path: Path) -> list[Truth]:
+@dataclass(frozen=True, slots=True, eq=False)
+class TruthFile:
+    """Truth that was read, none of an empty one. note: what was made of it, in words; empty where nothing was."""
+
+    path: Path | None = None
+    told: tuple[Truth, ...] = ()
+    table: GpsTable | None = None
+
+    @property
+    def names(self) -> dict[int, str]:
+        """Of true objects that have some, by id."""
+        return self.table.names if self.table is not None else {}
+
+    @property
+    def note(self) -> str:
+        return f"truth of {self.path}: {self.table.note}" if self.table is not None else ""
+
+    def messages(self, book: Logbook) -> list[Truth]:
+        """As messages of the mission of `book`. Raises `ReviewError` where they do not go with it."""
+        if self.table is None:
+            return list(self.told)
+        pictures = [book.first_pictures[name].frame for name in book.centres]
+        known = pictures[:1] or [found[0] for found in [book.default_space()] if found]
+        if not known:
+            raise ReviewError(f"{self.path}: the mission has no tracks, and so no frame")
+        return self.table.messages(known[0])
+
+
+NO_TRUTH = TruthFile()
+
+
+def read_truth(path: Path) -> TruthFile:
     """Its truth messages; of a table one for each run of rows of one time. Raises `ReviewError` for a file that has
     none or is not as it must be, FileNotFoundError, and what `recording.read` raises."""
-    if not path.is_file():
+    if path.suffix == ".csv" and path.is_file() and is_gps_table(path):
+        return TruthFile(path, table=read_gps(path))
+    return TruthFile(path, told=tuple(_read(path)))
+
+
+def _read(path: Path) -> list[Truth]:
+    if not path.exists() or (path.is_dir() and path.suffix in (".csv", ".parquet")):
         raise FileNotFoundError(f"no truth at {path}")
     if path.suffix == ".csv":
         found = [truth for table in _csv(path) for truth in _messages(table, path)]

@@ -15,6 +15,7 @@ from fusion_service import geodesy
 from fusion_service.densities import moments
 from fusion_service.recording import Recorder, read
 from fusion_service.recording.parts import unused
+from fusion_service.recording.scoring import scoring_of
 from fusion_service.recording.survey import key_of
 from fusion_service.review.explain.mission import RecordedMission
 from schemas import GlobalTracks, LocalTracks, Message, MessageError, StepLog, Truth, decode, encode
@@ -32,7 +33,8 @@ def write_view(mission: RecordedMission, out: str | Path, stop: Event | None = N
     stop = stop or Event()
     assert mission.story is not None, "the mission is read with a track"
     near = _near(mission, stop)
-    with Recorder(unused(out), realm=mission.centre.realm, focus=mission.story.track) as recorder:
+    kept = scoring_of(mission.path)._asdict()
+    with Recorder(unused(out), realm=mission.centre.realm, focus=mission.story.track, **kept) as recorder:
         for raw in read(mission.path):
             if stop.is_set():
                 break

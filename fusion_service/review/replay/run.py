@@ -22,6 +22,7 @@ from fusion_service.config.settings import plain_settings
 from fusion_service.errors import ReviewError
 from fusion_service.progress import Progress
 from fusion_service.recording import RawMessage, read
+from fusion_service.recording.scoring import scoring_of
 from fusion_service.recording.steps import Step
 from fusion_service.recording.survey import RecordedCentre, Survey, key_of, survey
 from fusion_service.review.replay.clock_engine import ClockEngine
@@ -124,7 +125,8 @@ def run_replay(
     with ExitStack() as stack:
         writer = None
         if out is not None:
-            writer = stack.enter_context(ReplayWriter(out, found.realm, keep_recorded=keep_recorded, draw=draw))
+            kept = {"keep_recorded": keep_recorded, "draw": draw}
+            writer = stack.enter_context(ReplayWriter(out, found.realm, scoring=scoring_of(found.path), **kept))
         say(_first_line(replay, followed, own))
         begin = time.perf_counter()
         _play(replay, found, followed if by_log else None, own, writer, stop)
@@ -247,4 +249,5 @@ def _numbers(player: Player) -> dict[str, Any]:
 
 
 def _difference(one: Difference) -> dict[str, Any]:
-    return {**one._asdict(), "relative": None if math.isnan(one.relative) else one.relative}
+    track = None if one.track is None else str(one.track)  # ids have more bits than JavaScript keeps of a number
+    return {**one._asdict(), "track": track, "relative": None if math.isnan(one.relative) else one.relative}

@@ -10,6 +10,7 @@ from typing import Self
 from fusion_service.centre import StepResult
 from fusion_service.recording import RawMessage, Recorder
 from fusion_service.recording.parts import unused
+from fusion_service.recording.scoring import Scoring
 from fusion_service.recording.survey import key_of
 from fusion_service.review.replay.verifying import published_as
 from schemas import Message, encode, global_key
@@ -24,12 +25,20 @@ STATUS_PERIOD = 10**9
 
 class ReplayWriter:
     """Writes one new recording; a context manager that closes it. Arguments as of `Recorder`; keep_recorded: with what
-    the mission's own centres published."""
+    the mission's own centres published; scoring: that of the mission."""
 
-    def __init__(self, path: str | Path, realm: str, *, keep_recorded: bool = True, draw: bool = True) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        realm: str,
+        *,
+        keep_recorded: bool = True,
+        draw: bool = True,
+        scoring: Scoring = Scoring(),  # noqa: B008
+    ) -> None:
         self._realm = realm
         self._keep_recorded = keep_recorded
-        self._recorder = Recorder(unused(path), realm=realm, draw=draw)
+        self._recorder = Recorder(unused(path), realm=realm, draw=draw, **scoring._asdict())
         self._messages = self._bytes = 0
         self._told: dict[str, int] = {}
         self._began: dict[str, int] = {}

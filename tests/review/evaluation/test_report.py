@@ -115,7 +115,7 @@ def test_it_says_the_numbers(text: str, assessed: Assessment) -> None:
         assert row[1] == digits(one.rmse_position)
     for heading in (
         "Map",
-        "Against the truth",
+        "Tracks against the truth",
         "Over time",
         "Sources against each other",
         "Refused and dropped",
@@ -147,7 +147,7 @@ def test_rules_stand_beside_each_other_with_the_best_marked(flown: list[Message]
 def test_without_truth_and_without_tracks_of_a_centre(flown: list[Message]) -> None:
     blind = [message for message in flown if not isinstance(message, Truth)]
     page = Page(report([assess(Logbook(blind), rows=500)]))
-    assert "Against the truth" not in page.headings
+    assert "Tracks against the truth" not in page.headings
     assert "Sources against each other" in page.headings
     assert "Map" in page.headings
     one = [message for message in blind if message.source != "main"]
@@ -155,7 +155,7 @@ def test_without_truth_and_without_tracks_of_a_centre(flown: list[Message]) -> N
     assert "Gaps" in page.headings
     alone = [message for message in flown if message.source != "main"]
     page = Page(report([assess(Logbook(alone), c=300.0, rows=500)]))
-    assert {"Against the truth", "Over time"} <= set(page.headings)
+    assert {"Tracks against the truth", "Over time"} <= set(page.headings)
     assert not any(row and row[0].startswith("fused") for row in page.rows)
     with pytest.raises(ValueError, match="no global tracks"):
         assess(Logbook([]))

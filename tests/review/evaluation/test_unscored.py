@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from fusion_service.review.evaluation import evaluate, format_table
+from fusion_service.review.evaluation.logbook import Logbook
 from schemas import Local, Message
-from tests.helpers.missions import FRAME, STILL, info, picture, still, tracks, truth
+from tests.helpers.missions import FRAME, STILL, at, info, picture, still, tracks, truth
 
 
 def test_what_cannot_be_scored_is_left_out_by_name() -> None:
@@ -72,3 +74,19 @@ def test_one_of_several_centres() -> None:
         evaluate([*still(3), *other], c=10.0, every=None, centre="x")
     with pytest.raises(ValueError, match="must be positive"):
         evaluate(still(3), c=10.0, every=0.0)
+
+
+def test_a_mission_whose_first_picture_has_no_frame_is_scored_in_that_of_the_next() -> None:
+    """A centre that knows no frame yet says an empty picture in a local frame "none"."""
+    nothing = [picture(t, [], [], frame=Local("none")) for t in (0, 1)]
+    later = [truth(t, [1], STILL) for t in range(6)] + [picture(t, [1], [[3.0, 0.0]]) for t in range(2, 6)]
+    result = evaluate([*nothing, *later], c=10.0, every=None)
+    assert len(result.times) == 6
+    assert np.isnan(result.fused.errors[:2, 0]).all()
+    assert result.fused.rmse_position == pytest.approx(3.0)
+
+
+def test_one_wrong_clock_does_not_make_the_mission_begin_in_1970() -> None:
+    wrong = [replace(tracks("b", t, [1], STILL), time=t) for t in range(3)]
+    assert Logbook([*still(3), *wrong]).span == (at(0), at(3))
+    assert Logbook([]).span is None

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import argparse
 import dataclasses
 import json
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from fusion_service.cli import main
+from fusion_service.commands import replay as command
 from fusion_service.config import config_hash
+from fusion_service.errors import ReviewError
 from schemas import GlobalTracks
 from tests.helpers import flown
 from tests.helpers.flown import Flight, edited, record
@@ -103,3 +107,28 @@ def test_a_service_killed_and_started_again_is_verified_from_its_recording(hub: 
     assert told["verify"]["compared"] >= 20
     assert told["remarks"] == []
     assert told["variants"][0]["config"]["rule"] == "hmd-ga"
+
+
+def test_a_verification_that_is_stopped_has_not_passed(mission: Path) -> None:
+    """At once, and after some steps: it says how far it came, and ends with code 1."""
+    parser = argparse.ArgumentParser()
+    command.add(parser)
+    args = parser.parse_args([str(mission), "--verify"])
+
+    class Later(threading.Event):
+        """Set when it has been asked so often."""
+
+        def __init__(self, limit: int) -> None:
+            super().__init__()
+            self.left = limit
+
+        def is_set(self) -> bool:
+            self.left -= 1
+            return self.left < 0
+
+    asked = Later(10**6)
+    command.run(args, asked)
+    whole = 10**6 - asked.left
+    for limit, says in ((0, "stopped"), (whole - 20, r"stopped after [1-9]\d* steps were compared; .*")):
+        with pytest.raises(ReviewError, match=f"{says}.* is not verified"):
+            command.run(args, Later(limit))
