@@ -1,0 +1,33 @@
+"""`rule = "my_rule.py:fuse"` in a config file: the file is loaded, and the rule gets a name that says which."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+__all__ = ["with_own_rule"]
+
+
+def with_own_rule(raw: dict[str, Any], folder: Path, problems: list[tuple[tuple[str, ...], str]]) -> dict[str, Any]:
+    """The tables of a config file, a rule of one's own loaded from its file, relative to the config's `folder`. What is
+    wrong with it goes to `problems`, and the rule is left out."""
+    centre = raw.get("centre")
+    rule = centre.get("rule") if isinstance(centre, Mapping) else None
+    if not isinstance(centre, Mapping) or not isinstance(rule, str):
+        return raw
+    from fusion_service.rules import RuleError, is_own, load_own
+
+    if not is_own(rule):
+        return raw
+    rest = {key: value for key, value in centre.items() if key not in ("rule", "rule_options")}
+    try:
+        if "#" in rule:
+            raise RuleError(f"is {rule!r}: leave out what follows #, the hash is made of the file")
+        loaded, options = load_own(rule, folder)
+        if options:
+            raise RuleError(f"is {rule!r}: write its options as rule_options, as in rule_options = {{factor = 2.0}}")
+    except RuleError as error:
+        problems.append((("centre", "rule"), str(error)))
+        return {**raw, "centre": rest}
+    return {**raw, "centre": {**centre, "rule": loaded.name}}
