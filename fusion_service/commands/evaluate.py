@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from fusion_service.commands import requirements
 from fusion_service.commands.sealed import add_authority
 from fusion_service.process import argument, positive
 from fusion_service.progress import Progress
@@ -24,7 +25,9 @@ EXAMPLE = (
     "fusion-service evaluate mission.rrd\n"
     "  fusion-service evaluate mission.rrd --cutoff 5000 --html report.html --json scores.json\n"
     "  fusion-service evaluate ci.rrd naive.rrd --html rules.html      one row for each centre of each recording\n"
-    "  fusion-service evaluate mission.rrd --truth gps.csv --every 1"
+    "  fusion-service evaluate mission.rrd --truth gps.csv --every 1\n"
+    "  fusion-service evaluate mission.rrd --profile en-route --html report.html    requirements, passed or failed\n"
+    "  fusion-service evaluate mission.rrd --reference each       no truth: every source by all others"
 )
 SAMPLE = 20_000
 """Tracks of each source on the map, about."""
@@ -32,7 +35,7 @@ SAMPLE = 20_000
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
-    parser.add_argument("recordings", metavar="FILE", nargs="+", help="recordings (.rrd)")
+    parser.add_argument("recordings", metavar="FILE", nargs="*", help="recordings (.rrd)")
     parser.add_argument("--truth", metavar="FILE", help="truth: a recording, or a table as `export` writes it")
     parser.add_argument(
         "--cutoff",
@@ -46,6 +49,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--centre", metavar="NAME", action="append", help="only this centre; may be repeated")
     parser.add_argument("--json", metavar="FILE", help="write every number here")
     parser.add_argument("--html", metavar="FILE", help="write a page for people here")
+    requirements.add(parser)
     add_authority(parser)
 
 
@@ -56,7 +60,9 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.review.evaluation.results import results, text
     from fusion_service.review.evaluation.truth import read_truth
     from fusion_service.review.outputs import check_page
+    from fusion_service.review.profiles import telling
 
+    profile = requirements.begin(args)
     for page in filter(None, (args.json, args.html)):
         check_page(page, *args.recordings, *filter(None, [args.truth]))
     _need_rerun()
@@ -65,12 +71,14 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
 
         need_matplotlib()
     done: list[Assessment] = []
+    references: list[list[Truth]] = []
     seals = []
     try:
         truths = read_truth(Path(args.truth)) if args.truth else []
         for path in map(Path, args.recordings):
             cutoff = args.cutoff or (done[0].c if done else None)
-            scored = _assess(path, truths, cutoff, args, stop)
+            scored, by = _assess(path, truths, cutoff or (profile.cutoff if profile else None), args, stop)
+            references.append(by)
             seals.append(find(str(path), args.ca, stop))
             done.append(scored)
     except Stopped:
@@ -84,19 +92,28 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
         )
     print(text(done))
+    if args.reference == "each":
+        requirements.each_source(args, done)
+    judged = requirements.told(args, profile, done, references) if profile else []
+    if judged:
+        print(telling.text(judged))
     for recording, seal in zip(args.recordings, seals, strict=False):
         say(recording, seal)
     if args.json:
         scores = results(done)
         for told, seal in zip(scores["recordings"], seals, strict=False):
             told["seal"] = seal.as_json()
+        if profile:
+            scores["requirements"] = telling.as_json(judged)
         Path(args.json).write_text(json.dumps(scores, allow_nan=False) + "\n", encoding="utf-8")
         print(f"scores: {args.json}")
     if args.html:
         from fusion_service.review.evaluation.report import report
 
-        Path(args.html).write_text(report(done), encoding="utf-8")
+        Path(args.html).write_text(report(done, telling.page(judged)), encoding="utf-8")
         print(f"page:   {args.html}")
+    if profile:
+        requirements.conclude(judged)
 
 
 def _need_rerun() -> None:
@@ -111,7 +128,7 @@ def _need_rerun() -> None:
 
 def _assess(
     path: Path, truths: list[Truth], cutoff: float | None, args: argparse.Namespace, stop: threading.Event
-) -> Assessment:
+) -> tuple[Assessment, list[Truth]]:
     from fusion_service.errors import ReviewError, Stopped
     from fusion_service.review.evaluation import assess
     from fusion_service.review.evaluation.logbook import Logbook
@@ -134,7 +151,8 @@ def _assess(
         if args.centre and not chosen:
             there = ", ".join(book.centres) or "none"
             raise ReviewError(f"{path} has no centre {' or '.join(map(repr, args.centre))}; there are: {there}")
-        return assess(
+        truths = truths or requirements.reference(args, book)
+        scored = assess(
             book,
             c=cutoff,
             every=args.every,
@@ -143,3 +161,4 @@ def _assess(
             progress=showing(0.3, 0.7, 1.0),
             rows=SAMPLE if args.html else 0,
         )
+        return scored, truths

@@ -8,13 +8,13 @@
 
 Keyword arguments after `*` are its options. It is one file, run once when it is loaded, and known by its name and the
 first digits of the SHA-256 of the file: `my_rule.py:fuse#0f3c...`. That is the rule's name in the settings of a centre,
-their hash, step logs and pictures: what fused a mission can be told, and a replay finds out that a file is another one.
+their hash, step logs and pictures: what fused a mission can be told, and a replay finds out that a file is another.
 What the file imports is not in the hash. A name loads nothing: only `load_own` does, which callers use for what their
 own user wrote, in a config or on a command line, never for what a recording or the bus says.
 
-What it gives is checked, every batch: shapes, finite numbers, symmetric positive definite covariances. `own_fuse` raises
-RuleError for it; in a centre what is wrong becomes NaN, which the centre mends and logs, and each kind of fault is said
-once in the process's log.
+What it gives is checked, every batch: shapes, finite numbers, symmetric positive definite covariances. `own_fuse`
+raises RuleError for it; in a centre what is wrong becomes NaN, which the centre mends and logs, and each kind of fault
+is said once in the process's log.
 """
 
 from __future__ import annotations

@@ -3,8 +3,8 @@
 Excess: the largest eigenvalue of E[e e'], e the error of the fused mean in units of the covariance stated with it
 (e = L^-1 (x - truth), P = L L'), over errors of the sources that have their covariances and are correlated one way or
 another: P_ij = L_i C L_j', C = 0 (independent), I (the same error in both), and random orthogonal C for two sources, at
-a strength of 1 and of 1/2 (`|P_i^-1/2 P_ij P_j^-T/2|`). 1 or less is conservative in that case; 2 is a variance twice
-as large as stated in some direction. By Monte Carlo: an eigenvalue of n true 1 comes out at about 1 + 2 sqrt(n / samples),
+a strength of 1 and of 1/2 (`|P_i^-1/2 P_ij P_j^-T/2|`). 1 or less is conservative there; 2 is a variance twice as
+large as stated in some direction. By Monte Carlo: an eigenvalue of n true 1 comes out at about 1 + 2 sqrt(n / samples),
 so up to `noise` nothing is said.
 """
 
