@@ -62,6 +62,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.review.outputs import check_page
     from fusion_service.review.profiles import telling
 
+    if requirements.listed(args):
+        return
     profile = requirements.begin(args)
     for page in filter(None, (args.json, args.html)):
         check_page(page, *args.recordings, *filter(None, [args.truth]))
@@ -77,8 +79,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         truths = read_truth(Path(args.truth)) if args.truth else []
         for path in map(Path, args.recordings):
             cutoff = args.cutoff or (done[0].c if done else None)
-            scored, by = _assess(path, truths, cutoff or (profile.cutoff if profile else None), args, stop)
-            references.append(by)
+            scored, given = _assess(path, truths, cutoff or (profile.cutoff if profile else None), args, stop)
+            references.append(given)
             seals.append(find(str(path), args.ca, stop))
             done.append(scored)
     except Stopped:
@@ -91,6 +93,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         raise ReviewError(
             f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
         )
+    if by := requirements.by_what(args):
+        print(f"scored against {by}")
     print(text(done))
     if args.reference == "each":
         requirements.each_source(args, done)
@@ -103,6 +107,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         scores = results(done)
         for told, seal in zip(scores["recordings"], seals, strict=False):
             told["seal"] = seal.as_json()
+        scores["reference"] = by
         if profile:
             scores["requirements"] = telling.as_json(judged)
         Path(args.json).write_text(json.dumps(scores, allow_nan=False) + "\n", encoding="utf-8")
@@ -110,7 +115,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     if args.html:
         from fusion_service.review.evaluation.report import report
 
-        Path(args.html).write_text(report(done, telling.page(judged)), encoding="utf-8")
+        Path(args.html).write_text(report(done, [*telling.against(by), *telling.page(judged)]), encoding="utf-8")
         print(f"page:   {args.html}")
     if profile:
         requirements.conclude(judged)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from fusion_service.review.profiles.telling import Told
     from schemas import Truth
 
-__all__ = ["add", "begin", "conclude", "each_source", "reference", "told"]
+__all__ = ["add", "begin", "by_what", "conclude", "each_source", "listed", "reference", "told"]
 
 WITHOUT = "without:"
 
@@ -39,9 +38,21 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def begin(args: argparse.Namespace) -> Profile | None:
-    """The profile asked for, read. Raises `ProfileError`, `UsageError`; of `--profile list` prints them and exits."""
+def listed(args: argparse.Namespace) -> bool:
+    """Whether it was `--profile list`: prints them."""
+    if args.profile != "list":
+        return False
     from fusion_service.review.profiles import load_profile, shipped
+
+    for name, path in shipped().items():
+        one = load_profile(name)
+        print(f"{name:<20}{one.name}: {len(one.requirements)} requirements; {one.source}\n{'':<20}{path}")
+    return True
+
+
+def begin(args: argparse.Namespace) -> Profile | None:
+    """The profile asked for, read. Raises `ProfileError`, `UsageError`."""
+    from fusion_service.review.profiles import load_profile
 
     what = args.reference
     if what is not None:
@@ -49,11 +60,6 @@ def begin(args: argparse.Namespace) -> Profile | None:
             raise UsageError(f"--reference {what}: write smoothed, without:SOURCE or each")
         if args.truth:
             raise UsageError("--reference and --truth: one of them")
-    if args.profile == "list":
-        for name, path in shipped().items():
-            one = load_profile(name)
-            print(f"{name:<20}{one.name}: {len(one.requirements)} requirements; {one.source}\n{'':<20}{path}")
-        sys.exit(0)
     if not args.recordings:
         raise UsageError("name a recording, as in evaluate mission.rrd")
     return load_profile(args.profile) if args.profile else None
@@ -75,7 +81,8 @@ def by_what(args: argparse.Namespace) -> str:
     if args.reference is None:
         return f"the truth in {args.truth}" if args.truth else ""
     left = args.reference[len(WITHOUT) :] if args.reference.startswith(WITHOUT) else ""
-    return "a reference smoothed from " + (f"all sources but {left}" if left else "all sources")
+    whose = f"all sources but {left}" if left else "all sources"
+    return f"a reference smoothed from {whose}, which does not see what these have in common"
 
 
 def told(

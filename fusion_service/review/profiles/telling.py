@@ -12,7 +12,7 @@ from fusion_service.review.evaluation.tables import aligned
 from fusion_service.review.profiles.judging import FAILED, NOT_SHOWN, PASSED, Judged, Verdict, worst
 from fusion_service.review.profiles.profile import KINDS, Profile, Requirement
 
-__all__ = ["Told", "as_json", "page", "summary", "text"]
+__all__ = ["Told", "against", "as_json", "page", "summary", "text"]
 
 MOST_TARGETS = 5
 MOST_COLUMNS = 40
@@ -135,6 +135,11 @@ def as_json(told: Sequence[Told]) -> list[dict[str, Any]]:
         }
         for each in told
     ]
+
+
+def against(reference: str) -> list[str]:
+    """The page's word of what all is scored against, where it is not the recording's own truth."""
+    return [f'<p class="lead">Scored against {escape(reference)}.</p>'] if reference else []
 
 
 def page(told: Sequence[Told]) -> list[str]:

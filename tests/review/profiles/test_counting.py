@@ -220,7 +220,7 @@ def test_areas_hold_by_place_and_height_in_metres_and_degrees() -> None:
     ):
         found = one(mission, need("detection", share_min=0.1, area="a"), [area])
         assert found.whole.samples == times, area
-    flat = [message for message in mission if not isinstance(message, Truth)]
+    flat: list[Message] = [message for message in mission if not isinstance(message, Truth)]
     flat += [truth(t, [1], [[10.0 * t, 0.0]]) for t in range(11)]
     with pytest.raises(ReviewError, match="heights"):
         one(flat, need("detection", share_min=0.1, area="a"), [Area("a", heights=(0.0, 1.0))])
