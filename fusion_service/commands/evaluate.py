@@ -15,7 +15,9 @@ from fusion_service.process import argument, positive
 from fusion_service.progress import Progress
 
 if TYPE_CHECKING:
+    from fusion_service.recording.finding import Finding
     from fusion_service.review.evaluation import Assessment
+    from fusion_service.review.profiles import Profile
     from schemas import Truth
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
@@ -55,12 +57,10 @@ def add(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Score the recordings. Raises `ReviewError`, OSError."""
-    from fusion_service.commands.sealed import find, say
+    from fusion_service.commands.sealed import find
     from fusion_service.errors import ReviewError, Stopped
-    from fusion_service.review.evaluation.results import results, text
     from fusion_service.review.evaluation.truth import read_truth
     from fusion_service.review.outputs import check_page
-    from fusion_service.review.profiles import telling
 
     if requirements.listed(args):
         return
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         need_matplotlib()
     done: list[Assessment] = []
     references: list[list[Truth]] = []
-    seals = []
+    seals: list[Finding] = []
     try:
         truths = read_truth(Path(args.truth)) if args.truth else []
         for path in map(Path, args.recordings):
@@ -93,6 +93,21 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         raise ReviewError(
             f"no centre {min(wanted - there)!r} in these recordings; there are: {', '.join(sorted(there))}"
         )
+    _tell(args, done, references, seals, profile)
+
+
+def _tell(
+    args: argparse.Namespace,
+    done: list[Assessment],
+    references: list[list[Truth]],
+    seals: list[Finding],
+    profile: Profile | None,
+) -> None:
+    """Print, and write, what came of it. Raises `ReviewError`: also where a requirement of the profile is not met."""
+    from fusion_service.commands.sealed import say
+    from fusion_service.review.evaluation.results import results, text
+    from fusion_service.review.profiles import telling
+
     if by := requirements.by_what(args):
         print(f"scored against {by}")
     print(text(done))

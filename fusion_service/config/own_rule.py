@@ -6,7 +6,36 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["with_own_rule"]
+__all__ = ["is_loaded", "is_own_rule", "load_own_rule", "told_rule", "with_own_rule"]
+
+
+def is_own_rule(text: str) -> bool:
+    """Whether a text names a rule by its file."""
+    from fusion_service.rules import is_own
+
+    return is_own(text)
+
+
+def load_own_rule(text: str) -> tuple[str, str]:
+    """Load the rule whose file `text` names: its name, and its options as text. ValueError of one line."""
+    from fusion_service.rules import load_own
+
+    rule, options = load_own(text)
+    return rule.name, options
+
+
+def told_rule(name: str) -> tuple[str, str] | None:
+    """(`my_rule.py:fuse`, hash) of a rule of one's own as settings and pictures name it; None for any other."""
+    from fusion_service.rules.face.own import told_name
+
+    return told_name(name)
+
+
+def is_loaded(name: str) -> bool:
+    """Whether there is a rule of this name."""
+    from fusion_service.rules import RULES
+
+    return name in RULES
 
 
 def with_own_rule(raw: dict[str, Any], folder: Path, problems: list[tuple[tuple[str, ...], str]]) -> dict[str, Any]:

@@ -17,7 +17,6 @@ from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.errors import ReviewError
 from fusion_service.geodesy import ecef_to_geodetic, enu_to_geodetic, level_axes, vertical
 from fusion_service.metrics import assign_near, near_pairs
-from fusion_service.review.evaluation.assess import BLOCK
 from fusion_service.review.evaluation.logbook import Logbook
 from fusion_service.review.evaluation.reference import Reference, ScoredTruth, reference_for, scored_truth
 from fusion_service.review.snapshots import Block, ShownTracks, Times, TrackMessage, truth_path, truth_positions
@@ -27,6 +26,8 @@ __all__ = ["Observed", "Pairs", "Rest", "observe", "places_on_earth"]
 
 SAME_CLOCK = 3600.0
 NOTHING = -1
+BLOCK = 32
+"""Times looked at at once."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,13 +8,12 @@ from typing import Any, NamedTuple
 from fusion_service import __version__
 from fusion_service.centre import is_picture_of
 from fusion_service.config import BEFORE, CentreConfig, ConfigError, centre_config, config_hash
+from fusion_service.config.own_rule import is_loaded, told_rule
 from fusion_service.config.settings import nested, plain_settings
 from fusion_service.errors import ReviewError
 from fusion_service.recording.survey import RecordedCentre, Survey
 from fusion_service.review.replay.recorded_rule import missing_rule
 from fusion_service.review.replay.variants import Variant
-from fusion_service.rules import RULES
-from fusion_service.rules.face.own import told_name
 
 __all__ = ["MissionSettings", "RunSettings"]
 
@@ -85,7 +84,7 @@ class MissionSettings:
             rule = str(tables.get("rule", ""))
             if why := missing_rule(rule, ruled):
                 raise ReviewError(f"{found.path} {why}")
-            if told_name(rule) and rule not in RULES:
+            if told_rule(rule) and not is_loaded(rule):
                 continue
             try:
                 config = centre_config(tables)

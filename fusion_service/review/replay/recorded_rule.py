@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from fusion_service.config.own_rule import is_loaded, told_rule
 from fusion_service.errors import ReviewError
 from fusion_service.recording.survey import RecordedCentre
 from fusion_service.review.replay.variants import Variant
-from fusion_service.rules import RULES
-from fusion_service.rules.face.own import told_name
 
 __all__ = ["missing_rule", "recorded_rules", "with_recorded_rule"]
 
@@ -21,7 +20,7 @@ __all__ = ["missing_rule", "recorded_rules", "with_recorded_rule"]
 def recorded_rules(followed: RecordedCentre) -> list[str]:
     """Names of the rules of one's own in the settings of all runs, each once."""
     named = [str(tables.get("rule", "")) for tables in followed.settings.values()]
-    return list(dict.fromkeys(name for name in named if told_name(name)))
+    return list(dict.fromkeys(name for name in named if told_rule(name)))
 
 
 def with_recorded_rule(
@@ -31,14 +30,14 @@ def with_recorded_rule(
     files that are others. With `verify` ReviewError where there is such a one."""
     recorded, remarks, found = recorded_rules(followed), [], []
     for one in variants:
-        given = told_name(one.rule)
+        given = told_rule(one.rule)
         if given is None:
             found.append(one)
             continue
         if one.rule in recorded and not one.options:
             found.append(replace(one, rule=""))
             continue
-        other = [told for told in map(told_name, recorded) if told is not None and told[0] == given[0]]
+        other = [told for told in map(told_rule, recorded) if told is not None and told[0] == given[0]]
         if other and one.rule not in recorded:
             remarks.append(
                 f"{given[0]} is another file now: the mission was fused by that with hash {other[0][1]}, this has "
@@ -53,8 +52,8 @@ def with_recorded_rule(
 
 def missing_rule(name: str, replaced: bool) -> str:
     """Why settings with this rule cannot be used, empty where they can: it is not loaded, and not `replaced`."""
-    told = told_name(name)
-    if told is None or name in RULES or replaced:
+    told = told_rule(name)
+    if told is None or is_loaded(name) or replaced:
         return ""
     file = told[0].partition(":")[0]
     return (

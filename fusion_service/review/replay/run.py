@@ -18,6 +18,7 @@ from typing import Any
 
 from fusion_service.centre import StepResult
 from fusion_service.config import config_hash, load_config
+from fusion_service.config.own_rule import is_own_rule
 from fusion_service.config.settings import plain_settings
 from fusion_service.errors import ReviewError
 from fusion_service.progress import Progress
@@ -33,7 +34,6 @@ from fusion_service.review.replay.recorded_rule import with_recorded_rule
 from fusion_service.review.replay.variants import variants_of
 from fusion_service.review.replay.verifying import Difference, Verdict
 from fusion_service.review.replay.writer import ReplayWriter
-from fusion_service.rules import is_own
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, centre_source, decode
 
 __all__ = ["Replay", "run_replay"]
@@ -103,7 +103,7 @@ def run_replay(
 
     `ReviewError` or `ConfigError` says what is wrong with what was asked, before anything is written.
     """
-    if verify and (settings or clock or not all(map(is_own, rules)) or len(rules) > 1):
+    if verify and (settings or clock or not all(map(is_own_rule, rules)) or len(rules) > 1):
         raise ReviewError("--verify makes the mission as it was: leave out --rule, --set and --clock")
     stop = stop or Event()
     given = None if config is None else load_config(config).centre

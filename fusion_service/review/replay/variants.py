@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fusion_service.config import CentreConfig, ConfigError, centre_config
+from fusion_service.config.own_rule import is_own_rule, load_own_rule
 from fusion_service.config.settings import change, merge
-from fusion_service.rules import RuleError, is_own, load_own
 
 __all__ = ["Variant", "variants_of"]
 
@@ -70,13 +70,12 @@ def variants_of(rules: Sequence[str], settings: Sequence[str], taken: Collection
 
 def _own(text: str) -> tuple[str, str] | None:
     """The name of a rule of one's own that `text` names, loaded, and its options; None where it names none."""
-    if not is_own(text):
+    if not is_own_rule(text):
         return None
     try:
-        loaded, options = load_own(text)
-    except RuleError as error:
+        return load_own_rule(text)
+    except ValueError as error:
         raise ConfigError([f"--rule {text}: {error}"]) from None
-    return loaded.name, options
 
 
 def _parts(text: str) -> list[str]:
