@@ -6,7 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-__all__ = ["is_loaded", "is_own_rule", "load_own_rule", "told_rule", "with_own_rule"]
+from fusion_service.config.config import ConfigError
+
+__all__ = ["is_loaded", "is_own_rule", "load_from_here", "load_own_rule", "told_rule", "with_own_rule"]
 
 
 def is_own_rule(text: str) -> bool:
@@ -22,6 +24,18 @@ def load_own_rule(text: str) -> tuple[str, str]:
 
     rule, options = load_own(text)
     return rule.name, options
+
+
+def load_from_here(text: str) -> tuple[str, str]:
+    """The same of a path from the working folder: the name, and what a config anywhere may say. `ConfigError`."""
+    try:
+        name, options = load_own_rule(text)
+    except ValueError as error:
+        raise ConfigError([f"--rule {text}: {error}"]) from None
+    if options:
+        raise ConfigError([f"--rule {text}: give its options with --set, as in --set rule_options.factor=2"])
+    file, _, function = text.rpartition(":")
+    return name, f"{Path(file).resolve()}:{function}"
 
 
 def told_rule(name: str) -> tuple[str, str] | None:

@@ -130,7 +130,7 @@ def _share(one: Requirement, good: int, samples: int) -> Verdict:
         assert most is not None
         bound = sure.upper(good, samples, one.confidence)
         kept, shown, asked, side = found <= most, bound <= most, most, "at most"
-    words = f"{level} {side} {bound:.4g}"
+    words = f"{level} {side} {100 * bound:.4g} %"
     if kept and not shown:
         wanted = sure.needed(asked, one.confidence) if one.confidence else 0.0
         if math.isinf(wanted):

@@ -16,6 +16,8 @@ __all__ = ["Told", "against", "as_json", "page", "summary", "text"]
 
 MOST_TARGETS = 5
 MOST_COLUMNS = 40
+SECONDS = {"longer_than_s": "in gaps over", "interval_s": "of", "horizon_s": "ahead by", "after_s": "after"}
+"""What keys are called beside a share."""
 MARKS = {PASSED: "good", FAILED: "high", NOT_SHOWN: "low"}
 
 
@@ -37,7 +39,8 @@ def asked(one: Requirement) -> str:
         if numbers.get(key) is not None:
             share = scale * numbers[key]
             within = next((f" within {_value(numbers, key)}" for key in _withins(one)), "")
-            return f"{sign} {share:.6g} %{within}"
+            key = next((key for key in SECONDS if numbers.get(key)), "")
+            return f"{sign} {share:.6g} %{within}" + (f" {SECONDS[key]} {numbers[key]:g} s" if key else "")
     for key, unit in (("rms_max_m", "m"), ("rms_max_m_per_s", "m/s"), ("per_target_hour_max", "per target hour")):
         if numbers.get(key) is not None:
             return f"<= {numbers[key]:g} {unit}"
@@ -151,19 +154,18 @@ def page(told: Sequence[Told]) -> list[str]:
             f"; against {each.reference}" if each.reference else ""
         )
         body.append(f'<p class="lead">{escape(about)}.</p>')
-        head = ("requirement", "area", "asked", "found", "samples", "verdict", "how sure", "source")
-        rows = []
+        head = ("requirement", "area", "asked", "found", "samples", "how sure", "verdict")
+        rows, sources = [], []
         for one in each.judged:
             need = one.requirement
             source = need.source + (f" (not verified: {need.unverified})" if need.unverified else "")
             cells = [need.name, need.area, asked(need), found(need, one.whole), _samples(one.whole, need)]
             marked = f'<td class="{MARKS[one.verdict]}">{one.verdict}</td>'
-            wide = "".join(
-                f'<td class="left" style="white-space:normal;min-width:16em">{escape(cell)}</td>'
-                for cell in (one.whole.words or "", source)
-            )
-            rows.append("".join(f'<td class="left">{escape(cell)}</td>' for cell in cells) + marked + wide)
+            sure = f'<td class="left" style="white-space:normal;min-width:14em">{escape(one.whole.words)}</td>'
+            rows.append("".join(f'<td class="left">{escape(cell)}</td>' for cell in cells) + sure + marked)
+            sources.append(f"<dt>{escape(need.name)}</dt><dd>{escape(source)}</dd>" if source else "")
         body.append(_table([f'<th class="left">{cell}</th>' for cell in head], rows))
+        body.append(f'<dl class="facts">{"".join(sources)}</dl>')
         body += _by_target(each)
         if each.profile.note:
             body.append(f'<p class="note">{escape(each.profile.note)}</p>')
