@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.errors import ReviewError
 from fusion_service.geodesy import ecef_to_geodetic, enu_to_geodetic, level_axes, vertical
-from fusion_service.metrics import assign_near, near_pairs
+from fusion_service.metrics import DENSE, assign_near, near_pairs
 from fusion_service.review.evaluation.logbook import Logbook
 from fusion_service.review.evaluation.reference import Reference, ScoredTruth, reference_for, scored_truth
 from fusion_service.review.snapshots import Block, ShownTracks, Times, TrackMessage, truth_path, truth_positions
@@ -174,12 +175,14 @@ class _Walk:
         """Targets and rows that belong together, and the distance (M,) of every row to its nearest target."""
         there = np.flatnonzero(self._exists[k])
         places = self._scored.states[k, there, : self._d]
-        i, j, apart = near_pairs(places, states[:, : self._d], self._reference.c)
+        crowd = cKDTree(places) if len(there) * len(states) > DENSE else None
+        i, j, apart = near_pairs(places if crowd is None else crowd, states[:, : self._d], self._reference.c)
         kept = assign_near(i, j, self._reference.c**2 - apart**2, (len(there), len(states)))
         nearest = np.full(len(states), np.inf)
-        for begin in range(0, len(states), 256) if len(there) else ():
-            some = states[begin : begin + 256, : self._d]
-            nearest[begin : begin + 256] = np.sqrt(((some[:, None] - places[None]) ** 2).sum(axis=2)).min(axis=1)
+        if crowd is not None:
+            nearest = crowd.query(states[:, : self._d])[0]
+        elif len(there) and len(states):
+            nearest = np.sqrt(((states[:, None, : self._d] - places[None]) ** 2).sum(axis=2)).min(axis=1)
         return there[i[kept]], j[kept], nearest, there
 
     def source(self, k: int, block: Block, row: int) -> None:

@@ -244,3 +244,16 @@ def test_an_earth_centred_picture_is_level_at_the_place() -> None:
     for direction, value in (("across", 30.0), ("along", 0.0), ("height", 0.0)):
         found = one(mission, need("position_error", rms_max_m=50.0, direction=direction), c=100.0)
         assert found.whole.found == pytest.approx(value, abs=2e-2)
+
+
+def test_a_crowd_counts_as_a_few_do() -> None:
+    """Of 60 targets on a line 50 have a track, 6 m off; 10 tracks are far from all."""
+    places = [[100.0 * one, 0.0] for one in range(60)]
+    shown = [[100.0 * one, 6.0] for one in range(50)] + [[100.0 * one, 5000.0] for one in range(10)]
+    mission: list[Message] = []
+    for t in range(3):
+        mission += [truth(t, list(range(60)), places), picture(t, list(range(100, 160)), shown)]
+    assert one(mission, need("detection", share_min=0.1)).whole.found == 50 / 60
+    assert one(mission, need("false_tracks", share_max=0.5)).whole.found == 10 / 60
+    assert one(mission, need("false_tracks", share_max=0.5, farther_than_m=5001.0)).whole.found == 0.0
+    assert one(mission, need("position_error", rms_max_m=9.0)).whole.found == pytest.approx(6.0)

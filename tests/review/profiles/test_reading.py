@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from fusion_service.review.profiles import ProfileError, load_profile, shipped
 from fusion_service.review.profiles.counting import COUNTING
 from fusion_service.review.profiles.profile import KINDS
 from fusion_service.review.profiles.telling import asked
+from tests.docs.pages import ROOT, blocks
 
 WRONG = """\
 [profile]
@@ -94,6 +96,20 @@ def test_the_shipped_ones_say_their_figures_and_where_these_stand() -> None:
     assert (gaps["en-route"]["longer_than_s"], gaps["en-route"]["share_max"]) == (16.4, 0.01)
     times = [need.numbers["after_s"] for need in profiles["ship-radar"].requirements if need.kind == "motion_after"]
     assert times == [60.0, 180.0]
+
+
+def test_the_profile_of_the_docs(tmp_path: Path) -> None:
+    (block,) = [one for one in blocks("docs/requirements.md") if one.text.startswith("[profile]")]
+    path = tmp_path / "harbour.toml"
+    path.write_text(block.text)
+    found = load_profile(str(path))
+    assert [area.name for area in found.areas] == ["fairway", "inner"]
+    assert found.identities == {17: "mmsi:257000000"}
+    page = (ROOT / "docs/requirements.md").read_text("utf-8")
+    for kind, keys in KINDS.items():
+        row = re.search(rf"^\| `{kind}` \|.*$", page, re.M)
+        assert row is not None
+        assert all(f"`{key}`" in row[0] for key, one in keys.keys.items() if one.needed), kind
 
 
 def test_every_kind_is_counted() -> None:
