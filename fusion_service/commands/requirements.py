@@ -6,8 +6,6 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_service.errors import UsageError
-
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
@@ -52,6 +50,7 @@ def listed(args: argparse.Namespace) -> bool:
 
 def begin(args: argparse.Namespace) -> Profile | None:
     """The profile asked for, read. Raises `ProfileError`, `UsageError`."""
+    from fusion_service.errors import UsageError
     from fusion_service.review.profiles import load_profile
 
     what = args.reference
