@@ -4,6 +4,7 @@ FusionError                           1  the root; in `schemas.errors`, for `sch
   Stopped                             0  a signal came; the command says what was done until then
   UsageError                          2  a command, or its options, as it was typed
   ConfigError             ValueError  2  fusion_service.config: every problem of a config, with file, line and key
+    ProfileError                      2  fusion_service.review.profiles: every problem of a profile, likewise
   MessageError            ValueError  1  schemas: a message that cannot be read or written
   BusError                            1  fusion_service.bus: an endpoint, a key, a hub that is not there
     BusStopped            Stopped     0  fusion_service.bus: stopped while it waited for the hub

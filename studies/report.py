@@ -231,7 +231,7 @@ first with its standard error over the runs; a published number follows in brack
 errors, the published number's own error (of the paper's number of runs) and its rounding included; otherwise by how
 much ours is off. Readings that had to be chosen are said, and what does not come out stays as it came out.
 
-To try a rule of your own in the same experiments, write a function `fuse(means, covariances)` with the batch last
-((N, n, B), (N, n, n, B) -> (n, B), (n, n, B)) into a file, and add `--rule my_rule.py:fuse` to the command; `--rule
+To try a rule of your own in the same experiments, write a function `fuse(means, covariances)` with the batch first
+((B, N, n), (B, N, n, n) -> (B, n), (B, n, n)) into a file, and add `--rule my_rule.py:fuse` to the command; `--rule
 bci:max_correlation=0.3` adds one of ours with other options.
 """

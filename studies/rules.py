@@ -1,22 +1,20 @@
 """Fusion rules as studies name them: `ci`, `ci:criterion=trace`, `bci:max_correlation=0.5`, `my_rule.py:fuse`.
 
-A rule of your own is a function in a Python file, called with the batch last, as `fusion_service.rules.fuse_last`:
-means (N, n, B), covariances (N, n, n, B) -> mean (n, B), covariance (n, n, B).
+A rule of your own is a function in a Python file, as a config and `replay` take it (`fusion_service.rules.face.own`):
+means (B, N, n), covariances (B, N, n, n) -> mean (B, n), covariance (B, n, n).
 """
 
 from __future__ import annotations
 
-import importlib.util
-from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from fusion_service.arrays import Floats
 from fusion_service.errors import FusionError
-from fusion_service.rules import RULES, Fused, RuleError, fuse_last
+from fusion_service.rules import RULES, Fused, RuleError, fuse_last, is_own, load_own
+from fusion_service.rules.face.own import OwnRule, loaded, own_fuse
 
 __all__ = ["Fuser", "OwnRuleError", "fuser"]
 
@@ -27,52 +25,44 @@ class OwnRuleError(FusionError):
 
 @dataclass(frozen=True, slots=True)
 class Fuser:
-    """A rule with its options; `weights`: "uniform", or None to let the rule choose. `function`: one of your own, and
+    """A rule with its options; `weights`: "uniform", or None to let the rule choose. `own`: one of your own, and
     `text`: how the command line named it, by which another process finds it again."""
 
     label: str
     rule: str = ""
     options: tuple[tuple[str, Any], ...] = ()
     weights: str | None = None
-    function: Callable[[Floats, Floats], tuple[Floats, Floats]] | None = None
+    own: OwnRule | None = None
     text: str = ""
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.text:
             return fuser, (self.text,)
-        return Fuser, (self.label, self.rule, self.options, self.weights, self.function)
+        return Fuser, (self.label, self.rule, self.options, self.weights, self.own)
 
     def __call__(self, means: Floats, covariances: Floats) -> Fused:
         """Fuse means (N, n, B) and covariances (N, n, n, B): mean (n, B), covariance (n, n, B), weights (N, B)."""
-        if self.function is not None:
+        if self.own is not None:
+            x, P = (np.ascontiguousarray(np.moveaxis(part, -1, 0)) for part in (means, covariances))
             try:
-                mean, covariance = map(np.asarray, self.function(means, covariances))
-            except Exception as error:
-                raise OwnRuleError(f"rule {self.text}: {type(error).__name__}: {error}") from error
-            wanted = means.shape[1:], covariances.shape[1:]
-            if (mean.shape, covariance.shape) != wanted:
-                got = f"{mean.shape} and {covariance.shape}, not {wanted[0]} and {wanted[1]}"
-                raise OwnRuleError(f"rule {self.text}: gives mean and covariance of shape {got}")
-            return Fused(mean, covariance, np.full(means[:, 0].shape, np.nan), None)
+                given = own_fuse(self.own, x, P, dict(self.options))
+            except RuleError as error:
+                raise OwnRuleError(str(error)) from error
+            mean, covariance, chosen = (np.moveaxis(part, 0, -1).copy() for part in given)
+            return Fused(mean, covariance, chosen, None)
         N, _, B = means.shape
-        weights = np.full((N, B), 1.0 / N) if self.weights == "uniform" else None
-        return fuse_last(self.rule, means, covariances, weights, **dict(self.options))
+        uniform = np.full((N, B), 1.0 / N) if self.weights == "uniform" else None
+        return fuse_last(self.rule, means, covariances, uniform, **dict(self.options))
 
 
 def fuser(text: str) -> Fuser:
     """The rule that `text` names; ValueError of one line for what is no rule."""
+    if is_own(text):
+        return _own(text)
     name, _, rest = text.partition(":")
-    if name.endswith(".py"):
-        return _own(Path(name), rest)
     if name not in RULES:
         raise ValueError(f"unknown rule {name!r}: one of {', '.join(RULES)}, or FILE.py:FUNCTION")
-    options: dict[str, Any] = {}
-    for part in filter(None, rest.split(",")):
-        key, equals, value = part.partition("=")
-        if not equals or (key not in RULES[name].options and key != "weights"):
-            known = ", ".join([*RULES[name].options, "weights"])
-            raise ValueError(f"rule {text!r}: {part!r} is not KEY=VALUE with one of {known}")
-        options[key] = _value(value)
+    options = _options(text, rest, [*RULES[name].options, "weights"])
     weights = options.pop("weights", None)
     one = Fuser(text, name, tuple(options.items()), weights)
     try:
@@ -80,6 +70,16 @@ def fuser(text: str) -> Fuser:
     except RuleError as error:
         raise ValueError(f"rule {text!r}: {error}") from None
     return one
+
+
+def _options(text: str, rest: str, known: list[str]) -> dict[str, Any]:
+    options: dict[str, Any] = {}
+    for part in filter(None, rest.split(",")):
+        key, equals, value = part.partition("=")
+        if not equals or key not in known:
+            raise ValueError(f"rule {text!r}: {part!r} is not KEY=VALUE with one of {', '.join(known) or 'none'}")
+        options[key] = _value(value)
+    return options
 
 
 def _value(text: str) -> Any:
@@ -93,16 +93,9 @@ def _value(text: str) -> Any:
     return text
 
 
-def _own(path: Path, name: str) -> Fuser:
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    if spec is None or spec.loader is None or not path.is_file():
-        raise ValueError(f"no file {path} to take a rule from")
-    module = importlib.util.module_from_spec(spec)
-    try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise ValueError(f"{path} cannot be run: {type(error).__name__}: {error}") from None
-    function = getattr(module, name, None)
-    if not callable(function):
-        raise ValueError(f"{path} has no function {name!r}: write {path}:FUNCTION")
-    return Fuser(f"{path.stem}.{name}", function=function, text=f"{path}:{name}")
+def _own(text: str) -> Fuser:
+    rule, rest = load_own(text)
+    own = loaded(rule.name)
+    assert own is not None
+    label = f"{own.path.stem}.{own.function.__name__}" + (f":{rest}" if rest else "")
+    return Fuser(label, rule.name, tuple(_options(text, rest, list(rule.options)).items()), own=own, text=text)

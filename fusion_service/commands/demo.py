@@ -29,7 +29,11 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="folder of the recordings, or that holds autoferry/, mrclam/ (default: $FUSION_DATA)",
     )
-    parser.add_argument("--rule", default="auto", help="fusion rule (default auto; `fusion-service rules` lists them)")
+    parser.add_argument(
+        "--rule",
+        default="auto",
+        help="fusion rule (default auto; `fusion-service rules` lists them), or FILE.py:FUNCTION",
+    )
     parser.add_argument("--criterion", help="of the rule's weights: det or trace")
     parser.add_argument(
         "--memory",

@@ -31,7 +31,8 @@ def add(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="RULE[:OPTION=VALUE,...]",
-        help="fuse by this rule, as a centre named after it; may be given several times (default: the mission's)",
+        help="fuse by this rule, or FILE.py:FUNCTION, as a centre named after it; may be given several times (default: "
+        "the mission's)",
     )
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="a setting of the centre, above the mission's"

@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 if TYPE_CHECKING:
     from fusion_service.recording.scoring import Scoring
     from fusion_service.review.evaluation import Assessment
-    from fusion_service.review.evaluation.truth import TruthFile
+    from fusion_service.review.evaluation.logbook import Logbook
+    from schemas import Truth
 
-__all__ = ["need_rerun", "scored_mission"]
+__all__ = ["Given", "need_rerun", "scored_mission"]
+
+
+class Given(Protocol):
+    """What a mission is scored against, in place of its own truth; names: of true objects that have some, by id."""
+
+    @property
+    def names(self) -> Mapping[int, str]: ...
+
+    def messages(self, book: Logbook) -> list[Truth]: ...
 
 
 def need_rerun() -> None:
@@ -28,7 +38,7 @@ def need_rerun() -> None:
 
 def scored_mission(
     path: Path,
-    truth: TruthFile,
+    truth: Given,
     how: Scoring,
     stop: threading.Event,
     *,

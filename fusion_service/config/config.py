@@ -166,7 +166,9 @@ class CentreConfig:
         "steps made again for late data, at most, for each step; 0: they are taken as they come",
     )
     max_future: float = _setting(2.0, DURATION, "how far ahead of its reception a message's time may be")
-    rule: str = _setting("auto", read_rule, "fusion rule (fusion-service rules lists them)")
+    rule: str = _setting(
+        "auto", read_rule, "fusion rule (fusion-service rules lists them), or your own: my_rule.py:fuse"
+    )
     rule_options: dict[str, Any] = _setting({}, rule_options, "options of the rule, e.g. {criterion = 'trace'}")
     weights: str = _setting(
         "kept",

@@ -23,6 +23,7 @@ from fusion_service.config.config import (
     SourceConfig,
 )
 from fusion_service.config.correlation import tried
+from fusion_service.config.own_rule import with_own_rule
 from fusion_service.config.toml_text import dotted, key_lines, line_of
 from schemas import Ecef, Motion, centre_source, check_source
 
@@ -46,6 +47,7 @@ def load_config(path: str | Path) -> ServiceConfig:
     except ValueError as error:  # TOMLDecodeError, or a number of too many digits
         raise ConfigError([f"{path}: not TOML: {error}"]) from None
     problems: Problems = []
+    raw = with_own_rule(raw, Path(path).parent, problems)
     known = {one.name: one for one in fields(ServiceConfig)}
     for name in raw:
         if name not in known and name != "security":  # fusion_service.bus reads that
@@ -167,6 +169,7 @@ def _contradictions(config: CentreConfig) -> Iterator[tuple[str, str]]:
 def _rule_problems(config: CentreConfig) -> list[str]:
     """Why the centre cannot fuse by this rule and its options: it is tried on one to three unit Gaussians."""
     from fusion_service.rules import RULES, RuleError, fuse_last
+    from fusion_service.rules.face.own import loaded
 
     try:
         rule, few = tried(config.rule, config.rule_options)
@@ -187,5 +190,7 @@ def _rule_problems(config: CentreConfig) -> list[str]:
         except (RuleError, TypeError, ValueError, OverflowError) as error:
             return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} here: {error}"]
         if not np.isfinite(fused.covariance).all():
+            if own := loaded(rule):
+                return [f"{config.rule} cannot fuse {count} sources here: {own.problem}"]
             return [f"{config.rule} cannot fuse {count} source{'s' * (count > 1)} of unit covariance here"]
     return []

@@ -78,8 +78,12 @@ def choice(*known: str) -> Callable[[Any], str]:
 
 def read_rule(value: Any) -> str:
     """The name of a fusion rule, or auto."""
-    from fusion_service.rules import RULES
+    from fusion_service.rules import RULES, is_own
 
+    if isinstance(value, str) and is_own(value):
+        if value in RULES:
+            return value
+        raise ValueError(f"is {value!r}, a rule of one's own that is not loaded: {NOT_LOADED}")
     return choice(*RULES, "auto")(value)
 
 
@@ -191,4 +195,5 @@ def maybe(read: Callable[[Any], T]) -> Callable[[Any], T | None]:
 
 
 DURATION = number(0.0, 1e6)
+NOT_LOADED = "its file is read where a config file or --rule names it, else by fusion_service.rules.load_own"
 POSITIVE = number(0.0, 1e6, above=True)

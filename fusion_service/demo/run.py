@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from fusion_service.config import centre_config, load_config
+from fusion_service.config.own_rule import is_own_rule, load_from_here
 from fusion_service.config.settings import change, merge
 from fusion_service.config.toml_text import dotted, toml_value
 from fusion_service.demo.crew import Crew, DemoError, client_arguments, free_endpoint, record_arguments
@@ -82,15 +83,18 @@ def run_demo(
         settings |= {"kind": "intensity", "rule": "ci", "rule_options": {}}
     for text in changes:
         merge(settings, change(text))
+    written = dict(settings)
+    if is_own_rule(str(settings["rule"])):
+        settings["rule"], written["rule"] = load_from_here(str(settings["rule"]))
     centre = centre_config(settings)
     rule = centre.intensity_rule if centre.kind == "intensity" else centre.rule
     stamp = time.strftime("%Y%m%dT%H%M%S", time.gmtime())
-    folder = out or Path("runs") / f"{scenario.replace(':', '-')}-{rule}-{stamp}"
+    folder = out or Path("runs") / f"{scenario.replace(':', '-')}-{rule.partition('.py:')[0]}-{stamp}"
     recording = folder / "mission.rrd"
     _check_outputs(recording, json_path)
     folder.mkdir(parents=True, exist_ok=True)
     endpoint = free_endpoint()
-    config = write_config(folder, settings, endpoint)
+    config = write_config(folder, written, endpoint)
     load_config(config)
     takes = plan.seconds / speed + START
     print(

@@ -8,12 +8,14 @@ each rule is and what it promises.
 
 A rule is one file here that declares `RULE = Rule(...)` (`base.rule`); nothing else needs to know of it. What rules
 share stands in `base`, the searches for weights in `weights`, rules for mixtures in `mixtures`, what callers see in
-`face`. `python -m fusion_service.rules` writes the tables of README.md and docs/rules.md anew.
+`face`. A rule of one's own, in a file anywhere, is loaded by `load_own`. `python -m fusion_service.rules` writes the
+tables of README.md and docs/rules.md anew.
 """
 
 from fusion_service.rules.base.options import RuleError
 from fusion_service.rules.base.rule import MixtureRule, Option, Rule
 from fusion_service.rules.face.gaussians import Fused, fuse, fuse_last
+from fusion_service.rules.face.own import is_own, load_own
 from fusion_service.rules.face.registry import RULES
 from fusion_service.rules.mixtures import MIXTURE_RULES, fuse_mixtures
 
@@ -28,4 +30,6 @@ __all__ = [
     "fuse",
     "fuse_last",
     "fuse_mixtures",
+    "is_own",
+    "load_own",
 ]

@@ -129,7 +129,7 @@ def recordings(folder: Path | None, numbers: tuple[int, ...]) -> Path:
 
 def in_centre(rule: Fuser) -> bool:
     """Whether a config can say it."""
-    return rule.function is None and rule.weights is None
+    return rule.weights is None
 
 
 def over(values: Floats) -> Estimate:

@@ -98,7 +98,7 @@ class Way(NamedTuple):
 def ways(run: Run) -> tuple[Way, ...]:
     """All that is compared; what goes through the centre first, "ci restart" before all."""
     papers, ours = [fuser(text) for text in PAPERS], [fuser(text) for text in OURS]
-    plain = [rule for rule in run.rules if rule.function is None and rule.weights is None]
+    plain = [rule for rule in run.rules if rule.weights is None]
     if run.runs < FEW:
         chosen, ours, quiet = [Way(papers[0], "restart"), Way(papers[2], "recursive")], [], []
     else:
@@ -203,7 +203,7 @@ def fly(seeds: tuple[int, ...], chosen: tuple[Way, ...], seed: int) -> Floats:
 
 def run(run: Run) -> Result:
     chosen = ways(run)
-    if any(way.rule.function for way in chosen):
+    if any(way.rule.own for way in chosen):
         run = replace(run, jobs=1)
     chunks = [tuple(range(first, min(first + CHUNK, run.runs))) for first in range(0, run.runs, CHUNK)]
     scores = np.concatenate(run.map(partial(fly, chosen=chosen, seed=run.seed), chunks, "runs"), axis=-1)

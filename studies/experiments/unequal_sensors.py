@@ -158,7 +158,7 @@ def wrong() -> dict[str, World]:
 
 
 def run(run: Run) -> Result:
-    own = tuple(rule for rule in run.rules if rule.function is None and rule.weights is None)
+    own = tuple(rule for rule in run.rules if rule.weights is None)
     rows: list[Row] = []
     known = map(fuser, (*MAIN, *OTHERS, *SAMPLED))
     for label, mse, said in exact((*known, *run.rules), run.rng(0), run.runs):

@@ -21,6 +21,7 @@ FILES = {path.stem for path in Path(commands.__path__[0]).glob("*.py")} - {
     "__init__",
     "arguments",
     "observed",
+    "requirements",
     "sealed",
 }
 

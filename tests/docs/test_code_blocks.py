@@ -311,6 +311,8 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
             recorder.handle(key, schemas.encode(one), one.sent)
         step(at)
     (folder / "centre.toml").write_text('[centre]\nrule = "ci"\n', "utf-8")
+    (own,) = [block.text for block in blocks("docs/rules.md") if block.text.startswith("# my_rule.py")]
+    (folder / "my_rule.py").write_text(own, "utf-8")
     return folder
 
 

@@ -37,7 +37,7 @@ def test_run_prints_a_table_and_writes_json_and_a_picture_of_it(
 
 def test_a_rule_of_ones_own_joins_the_experiment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     own = tmp_path / "half.py"
-    own.write_text("def fuse(means, covariances):\n    return means.mean(axis=0), covariances.mean(axis=0)\n")
+    own.write_text("def fuse(means, covariances):\n    return means.mean(axis=1), covariances.mean(axis=1)\n")
     target = tmp_path / "out.json"
     chosen = ["--rule", f"{own}:fuse", "--rule", "bci:max_correlation=1.0"]
     assert main(["run", COUNTER, "--runs", "4000", *chosen, "--json", str(target)]) == 0
@@ -83,8 +83,12 @@ def test_a_bar_in_a_name_does_not_end_its_cell(tmp_path: Path) -> None:
     ("body", "code", "words"),
     [
         ("def fuse(means, covariances): raise KeyError('x')", 1, "own.py:fuse: KeyError: 'x'"),
-        ("def fuse(means, covariances): return 3", 1, "own.py:fuse: TypeError"),
-        ("def fuse(means, covariances): return means, covariances", 1, "gives mean and covariance of shape"),
+        ("def fuse(means, covariances): return 3", 1, "own.py:fuse: gives int, not mean"),
+        (
+            "def fuse(means, covariances): return means, covariances",
+            1,
+            "own.py:fuse: gives mean (100, 2, 2), covariance (100, 2, 2, 2), not mean (100, 2)",
+        ),
         ("def fuse(:", 2, "own.py cannot be run: SyntaxError"),
     ],
 )

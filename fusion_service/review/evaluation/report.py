@@ -66,8 +66,8 @@ def need_matplotlib() -> None:
         raise ReviewError(f"a page needs matplotlib ({error}): {install_hint('report')}") from None
 
 
-def report(assessments: Sequence[Assessment]) -> str:
-    """The page about missions, of which there must be one."""
+def report(assessments: Sequence[Assessment], more: Sequence[str] = ()) -> str:
+    """The page about missions, of which there must be one; more: what stands before all details."""
     from fusion_service.review.evaluation.report_charts import charts
 
     rows = rows_of(assessments)
@@ -79,6 +79,7 @@ def report(assessments: Sequence[Assessment]) -> str:
             text = f"{label(one) or 'The mission'}: {one.unscored}. {truthless_lead(one)} What follows needs no truth."
             body.append(f'<p class="lead">{escape(text)}</p>')
     body += [_facts(one) for one in assessments]
+    body += more
     if len(rows) > 1:
         body += ["<h2>Rules beside each other</h2>", _rules(rows, ranked=comparison_of(assessments).ranked)]
     body += _map(assessments[0])

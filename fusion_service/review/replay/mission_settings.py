@@ -8,9 +8,11 @@ from typing import Any, NamedTuple
 from fusion_service import __version__
 from fusion_service.centre import is_picture_of
 from fusion_service.config import BEFORE, CentreConfig, ConfigError, centre_config, config_hash
+from fusion_service.config.own_rule import is_loaded, told_rule
 from fusion_service.config.settings import nested, plain_settings
 from fusion_service.errors import ReviewError
 from fusion_service.recording.survey import RecordedCentre, Survey
+from fusion_service.review.replay.recorded_rule import missing_rule
 from fusion_service.review.replay.variants import Variant
 
 __all__ = ["MissionSettings", "RunSettings"]
@@ -29,11 +31,18 @@ class MissionSettings:
     """The settings of each run of the centre that is followed. given: of a config file, above what is recorded.
 
     foreign: the hash of `given` where no run had these settings. first: those of the first run. told: in words.
+    ruled: every variant has a rule of its own.
     Raises `ReviewError` where the settings are not in the recording, or cannot be used.
     """
 
     def __init__(
-        self, found: Survey, followed: RecordedCentre | None, given: CentreConfig | None, *, by_clock: bool
+        self,
+        found: Survey,
+        followed: RecordedCentre | None,
+        given: CentreConfig | None,
+        *,
+        by_clock: bool,
+        ruled: bool = False,
     ) -> None:
         self.remarks: list[str] = []
         self.foreign = ""
@@ -55,7 +64,7 @@ class MissionSettings:
                 f"give the config of the mission with --config"
             )
         else:
-            self._look(found, followed)
+            self._look(found, followed, ruled)
         self.first = self._given or next(iter(self._recorded.values()))
         others = [version for version in followed.versions if version != __version__]
         if others:
@@ -67,11 +76,16 @@ class MissionSettings:
         runs = [self.first, *self._recorded.values()]
         return {name for tables in runs for name in tables.get("sources", {}) if is_picture_of(name)}
 
-    def _look(self, found: Survey, followed: RecordedCentre) -> None:
+    def _look(self, found: Survey, followed: RecordedCentre, ruled: bool) -> None:
         """Check the recorded settings: they must be usable, and those of their hash."""
         if followed.unknown:
             self.remarks.append(f"settings that this version does not know: {', '.join(sorted(followed.unknown))}")
         for code, tables in self._recorded.items():
+            rule = str(tables.get("rule", ""))
+            if why := missing_rule(rule, ruled):
+                raise ReviewError(f"{found.path} {why}")
+            if told_rule(rule) and not is_loaded(rule):
+                continue
             try:
                 config = centre_config(tables)
             except ConfigError as error:

@@ -18,6 +18,7 @@ from typing import Any
 
 from fusion_service.centre import StepResult
 from fusion_service.config import config_hash, load_config
+from fusion_service.config.own_rule import is_own_rule
 from fusion_service.config.settings import plain_settings
 from fusion_service.errors import ReviewError
 from fusion_service.progress import Progress
@@ -30,6 +31,7 @@ from fusion_service.review.replay.engine import Engine
 from fusion_service.review.replay.log_engine import LogEngine
 from fusion_service.review.replay.mission_settings import MissionSettings
 from fusion_service.review.replay.player import Player
+from fusion_service.review.replay.recorded_rule import with_recorded_rule
 from fusion_service.review.replay.variants import variants_of
 from fusion_service.review.replay.verifying import Difference, Verdict
 from fusion_service.review.replay.writer import ReplayWriter
@@ -102,7 +104,7 @@ def run_replay(
 
     `ReviewError` or `ConfigError` says what is wrong with what was asked, before anything is written.
     """
-    if verify and (rules or settings or clock):
+    if verify and (settings or clock or not all(map(is_own_rule, rules)) or len(rules) > 1):
         raise ReviewError("--verify makes the mission as it was: leave out --rule, --set and --clock")
     stop = stop or Event()
     given = None if config is None else load_config(config).centre
@@ -112,8 +114,12 @@ def run_replay(
     followed = found.chosen(centre)
     if verify and followed is None:
         raise ReviewError(f"{path} has no step logs of a centre: there is nothing to verify")
-    players = [Player(one) for one in variants_of(rules, settings, found.sources | set(found.centres))]
-    own = MissionSettings(found, followed, given, by_clock=clock)
+    variants = variants_of(rules, settings, found.sources | set(found.centres))
+    said: list[str] = []
+    if followed is not None:
+        variants, said = with_recorded_rule(variants, followed, verify=verify)
+    players = [Player(one) for one in variants]
+    own = MissionSettings(found, followed, given, by_clock=clock, ruled=all(one.rule for one in variants))
     if not found.inputs and not own.centres & {centre_source(name) for name in found.centres}:
         raise ReviewError(f"{path} holds no messages of sources: there is nothing to fuse")
     own.check([player.variant for player in players])
@@ -130,7 +136,7 @@ def run_replay(
         say(_first_line(replay, followed, own))
         begin = time.perf_counter()
         _play(replay, found, followed if by_log else None, own, writer, stop)
-    replay.remarks += own.remarks
+    replay.remarks += [*said, *own.remarks]
     _say_end(replay, time.perf_counter() - begin, say)
     return replay
 

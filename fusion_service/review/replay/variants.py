@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from fusion_service.config import CentreConfig, ConfigError, centre_config
+from fusion_service.config.own_rule import is_own_rule, load_own_rule
 from fusion_service.config.settings import change, merge
 
 __all__ = ["Variant", "variants_of"]
@@ -51,7 +52,8 @@ def variants_of(rules: Sequence[str], settings: Sequence[str], taken: Collection
     names = set(taken)
     found = []
     for text in rules or [""]:
-        rule, _, rest = text.partition(":")
+        own = _own(text)
+        rule, rest = own if own else text.partition(":")[::2]
         options: dict[str, Any] = {}
         for part in _parts(rest):
             try:
@@ -59,10 +61,21 @@ def variants_of(rules: Sequence[str], settings: Sequence[str], taken: Collection
             except ConfigError:
                 hint = "write NAME or NAME:OPTION=VALUE,..., as in --rule hmd-ga:criterion=trace"
                 raise ConfigError([f"--rule {text}: {hint}"]) from None
-        name = _free("-".join([rule, *map(_word, options.values())]) if rule else SAME, names)
+        short = rule.partition(".py:")[0] if own else rule
+        name = _free("-".join([short, *map(_word, options.values())]) if rule else SAME, names)
         names.add(name)
         found.append(Variant(name, rule, options, changes))
     return found
+
+
+def _own(text: str) -> tuple[str, str] | None:
+    """The name of a rule of one's own that `text` names, loaded, and its options; None where it names none."""
+    if not is_own_rule(text):
+        return None
+    try:
+        return load_own_rule(text)
+    except ValueError as error:
+        raise ConfigError([f"--rule {text}: {error}"]) from None
 
 
 def _parts(text: str) -> list[str]:

@@ -1,4 +1,4 @@
-"""The rules there are: what stands in the folder. `RULES`, by name.
+"""The rules there are: what stands in the folder, and rules of one's own that were loaded (`own`). `RULES`, by name.
 
 Every file of `fusion_service/rules` is one rule and declares it as `RULE`; the folders within are what rules share. So
 to add a rule is to add a file. A rule must not import this module, nor what does: the registry imports all of them.
@@ -12,9 +12,27 @@ from typing import TypeVar
 
 from fusion_service.rules.base.rule import Declaration, Rule
 
-__all__ = ["RULES", "collect"]
+__all__ = ["RULES", "Rules", "collect"]
 
 R = TypeVar("R", bound=Declaration)
+
+
+class Rules(Mapping[str, Rule]):
+    """The rules of the folder, in their order. One of somebody's own is found by its name once it is loaded, and is in
+    no list: `own` holds these."""
+
+    def __init__(self, shipped: Mapping[str, Rule]) -> None:
+        self._shipped = shipped
+        self.own: dict[str, Rule] = {}
+
+    def __getitem__(self, name: str) -> Rule:
+        return self._shipped[name] if name in self._shipped else self.own[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._shipped)
+
+    def __len__(self) -> int:
+        return len(self._shipped)
 
 
 def collect(kind: type[R], folder: Path, package: str) -> Mapping[str, R]:
@@ -39,4 +57,4 @@ def _found(folder: Path, package: str) -> Iterator[Declaration]:
             yield resolve_name(f"{package}.{file.name}:RULE")
 
 
-RULES: Mapping[str, Rule] = collect(Rule, Path(__file__).parents[1], "fusion_service.rules")
+RULES: Rules = Rules(collect(Rule, Path(__file__).parents[1], "fusion_service.rules"))
