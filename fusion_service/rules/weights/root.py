@@ -53,15 +53,8 @@ def root(slope: Slope, data: Floats, zero: Floats, one: Floats) -> Floats:
             if not left:
                 break
             at = np.flatnonzero(busy)
-            todo, v, lo, hi, data, busy, flip = (
-                todo[at],
-                v[at],
-                lo[at],
-                hi[at],
-                data.take(at, axis=-1),
-                busy[at],
-                flip[at],
-            )
+            todo, v, lo, hi, busy, flip = todo[at], v[at], lo[at], hi[at], busy[at], flip[at]
+            data = data.take(at, axis=-1)
         rest = 1.0 - v
         h, dh = slope(np.where(flip, rest, v), np.where(flip, v, rest), data)
         h = np.where(flip, -h, h)
