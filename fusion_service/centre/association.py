@@ -24,6 +24,7 @@ __all__ = [
     "CROWDED",
     "SOUND",
     "by_size",
+    "in_order",
     "candidate_pairs",
     "cluster",
     "leave_one_out",
