@@ -26,6 +26,7 @@ __all__ = [
     "by_size",
     "candidate_pairs",
     "cluster",
+    "in_order",
     "leave_one_out",
     "near_pairs",
     "overlap",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -19,17 +19,17 @@ from fusion_service.centre.extents import tells_extent
 from fusion_service.centre.frames import name_frame
 from fusion_service.centre.heights import with_height
 from fusion_service.centre.intervals import Pace, next_interval
+from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.scans import message_tracks
 from fusion_service.centre.sources import Source
 from fusion_service.centre.tracks import LINKS, Step, Tracks, empty_tracks, join_tracks
+from fusion_service.centre.words import Lexicon
+from fusion_service.config import CentreConfig, SourceConfig
 from fusion_service.geodesy import FrameError
 from fusion_service.records import altered, columns_of, made
 from schemas import Frame, Height, LocalTracks
 
-if TYPE_CHECKING:
-    from fusion_service.centre.intake import Intake
-
-__all__ = ["Conversion", "Table"]
+__all__ = ["Border", "Conversion", "Table"]
 
 SMALL = 64
 """Tracks of a message up to which it is made a table together with others: beyond, copies cost more than calls."""
@@ -47,11 +47,26 @@ class Table(NamedTuple):
     step: Step | None = None
 
 
+class Border(Protocol):
+    """What of the intake is asked here (see there)."""
+
+    @property
+    def config(self) -> CentreConfig: ...
+    @property
+    def frame(self) -> Frame | None: ...
+    @property
+    def said(self) -> Lexicon: ...
+    @property
+    def lineages(self) -> Lineages: ...
+    def declared(self, source: Source) -> SourceConfig: ...
+    def pace(self, source: Source, complete: bool) -> Pace: ...
+
+
 class Conversion:
     """The tables of `runs`: messages that are taken together, each of one source, space, frame and height. They are to
     be asked for in order, which is that in which texts and lineages get their codes."""
 
-    def __init__(self, runs: Sequence[list[Checked]], intake: Intake) -> None:
+    def __init__(self, runs: Sequence[list[Checked]], intake: Border) -> None:
         self._runs, self._intake = runs, intake
         self._keys: list[_Key | None] = [None] * len(runs) if intake.frame is None else [*map(self._key, runs)]
         self._ready: dict[int, Table] = {}
@@ -67,10 +82,9 @@ class Conversion:
                 self._together(place)
             if place in self._ready:
                 table = self._ready.pop(place)
-                # the pace of a source that said something before in this step is another by now
-                return (
-                    table if table.step is not None else table._replace(pace=self._intake.pace(source, first.complete))
-                )
+                if table.step is None:  # the pace of a source that said something before in this step is another now
+                    table = table._replace(pace=self._intake.pace(source, first.complete))
+                return table
         said = self._intake.declared(source)
         messages = [with_height(one, said.height, frame, space) for (_, one, _), _ in self._runs[place]]
         sound = [faults == 0 for _, faults in self._runs[place]]

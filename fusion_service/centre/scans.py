@@ -153,11 +153,6 @@ def message_tracks(
         parts = mixtures.log_weights, mixtures.means, linalg.symmetrise(mixtures.covariances)
     extent = message_extents(messages, sound, mean, frame)
     times = np.repeat(np.array([m.time for m in messages], dtype=np.int64), counts)
-    if all(m.updated is None for m in messages):
-        updated = times.copy()
-    else:
-        said_at = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
-        updated = np.minimum(_gather(said_at, some, np.int64), times)
     alone = not any(m.lineage for m in messages)
     return Tracks(
         id=_gather([m.ids for m in messages], some, np.uint64),
@@ -168,7 +163,7 @@ def message_tracks(
         part_mean=parts[1],
         part_covariance=parts[2],
         existence=_optional([m.existence for m in messages], some, counts, np.nan, np.float64),
-        updated=updated,
+        updated=_updated(messages, some, times),
         interval=np.zeros(len(times), dtype=np.int64),
         **_told(messages, some, counts, said),
         lineage=constant(len(times), ALONE, np.int32)
@@ -177,6 +172,14 @@ def message_tracks(
         extent=extent,
         **unlinked(len(times)),
     )
+
+
+def _updated(messages: Sequence[LocalTracks], some: Sequence[Mask], times: NDArray[np.int64]) -> NDArray[np.int64]:
+    """When each was last measured: not after its own time."""
+    if all(m.updated is None for m in messages):
+        return times.copy()
+    said = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
+    return np.minimum(_gather(said, some, np.int64), times)
 
 
 def _told(
