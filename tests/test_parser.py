@@ -39,7 +39,7 @@ def test_an_option_that_is_wrong_is_told_of_by_its_command(
 
 def test_sizes_have_units() -> None:
     assert [size(text) for text in ("500MB", "1.5 kB", "2GiB", "7B")] == [500_000_000, 1500, 2 * 2**30, 7]
-    for text in ("500", "1.5", "MB", "5 XB", "-1MB", ""):
+    for text in ("500", "1.5", "MB", "0", "5 XB", "-1MB", ""):
         with pytest.raises(ValueError):
             size(text)
 

@@ -20,7 +20,7 @@ TEXT = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)", re.ASCII)
 
 def size(text: str) -> int:
     """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500B` 500. Raises ValueError in one line."""
-    if (bare := TEXT.fullmatch(text.strip())) and not bare[2]:
+    if (bare := TEXT.fullmatch(text.strip())) and not bare[2] and 0.0 < float(bare[1]) < math.inf:
         raise ValueError(f"{text!r} has no unit: give one, as in {text.strip()}MB, or {text.strip()}B for bytes")
     value = _value(text, SIZES, "a size: give a number and B, kB, MB, GB, TB or KiB, MiB, GiB, as in 500MB")
     return math.ceil(value)

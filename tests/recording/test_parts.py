@@ -305,7 +305,8 @@ def test_a_part_is_free_once_the_next_has_begun(tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    ("text", "value"), [("500MB", 5e8), ("1.5 gib", 1.5 * 2**30), ("20GB", 2e10), ("7", 7), ("2k", 2000), (".5kB", 500)]
+    ("text", "value"),
+    [("500MB", 5e8), ("1.5 gib", 1.5 * 2**30), ("20GB", 2e10), ("7B", 7), ("2k", 2000), (".5kB", 500)],
 )
 def test_sizes(text: str, value: float) -> None:
     assert arguments.size(text) == value
