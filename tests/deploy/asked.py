@@ -25,8 +25,20 @@ from tests.helpers.processes import Program, eventually, free_endpoint
 from tests.helpers.scene import COMMAND, SENSOR
 
 ROOT = Path(__file__).parents[2]
-QUIET = ("Not trusted", "Refused")
+QUIET = ("Not trusted", "Lost to load")
 """Panels that are empty when all is well."""
+LATE = """
+import sys, time
+import numpy as np
+from schemas import Enu
+from sensor_clients.publisher import TrackPublisher
+with TrackPublisher("radar3", connect=sys.argv[1]) as publisher:
+    while True:
+        publisher.tracks(time=time.time_ns() - 60 * 10**9, space=("x", "y", "vx", "vy"), frame=Enu(59.0, -55.0),
+                         ids=[1], means=np.zeros((1, 4)), covariances=np.eye(4)[None])
+        time.sleep(1.0)
+"""
+"""A source whose tracks are a minute old when they come."""
 CENTRE = """
 [centre]
 period = 0.5
@@ -71,6 +83,7 @@ def fly(seconds: float, prometheus: str) -> list[tuple[dict[str, Any], list[list
         ):
             stack.enter_context(Program(COMMAND, *words))
         stack.enter_context(Program(SENSOR, endpoint, "radar1", "given", "0", "1", "2"))
+        stack.enter_context(Program(LATE, endpoint))
         other = stack.enter_context(Program(SENSOR, endpoint, "radar2", "reversed", "1", "2", "3"))
         line = [prometheus, f"--config.file={folder}/prometheus.yaml", f"--storage.tsdb.path={folder}/data"]
         with (folder / "prometheus.log").open("wb") as log:

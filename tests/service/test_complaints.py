@@ -32,6 +32,12 @@ def error(data: bytes) -> schemas.MessageError:
     return caught.value
 
 
+def test_a_machine_that_reads_the_log_is_told_source_and_reason(caplog: pytest.LogCaptureFixture) -> None:
+    complaints().misread("r\x1b1", b"{}", error(b"{}"), NOW)
+    (line,) = caplog.records
+    assert (getattr(line, "source", None), getattr(line, "reason", None)) == ("r\x1b1", "not-msgpack")
+
+
 def test_a_flood_of_names_is_bounded_in_memory_lines_and_status(caplog: pytest.LogCaptureFixture) -> None:
     told, fault = complaints(), error(b"{}")
     begin = time.monotonic()
