@@ -42,7 +42,7 @@ STANDS_ON = {
     },
     "fusion_service.review": {
         *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.config", "fusion_service.centre"),
-        "fusion_service.recording",
+        *("fusion_service.recording", "fusion_service.rules"),
     },
     "sensor_clients": {
         *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.bus", "fusion_service.hints"),

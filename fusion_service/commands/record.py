@@ -70,6 +70,11 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--no-draw", action="store_true", help="record the messages alone, without the picture")
     add_metrics(parser, "recorder")
+    _add_weeks(parser)
+    _add_live(parser)
+
+
+def _add_weeks(parser: argparse.ArgumentParser) -> None:
     weeks = parser.add_argument_group("for weeks", "any of these makes the recording a folder of parts")
     for name, kind, metavar, text in (
         ("--rotate-size", size, "SIZE", "of a part (default 500MB)"),
@@ -78,6 +83,9 @@ def add(parser: argparse.ArgumentParser) -> None:
         ("--keep-for", duration, "TIME", "delete parts older than 7d, say"),
     ):
         weeks.add_argument(name, type=argument(kind), metavar=metavar, help=text)
+
+
+def _add_live(parser: argparse.ArgumentParser) -> None:
     live = parser.add_argument_group("live")
     live.add_argument(
         "--live",

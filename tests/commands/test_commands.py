@@ -22,6 +22,7 @@ FILES = {path.stem for path in Path(commands.__path__[0]).glob("*.py")} - {
     "arguments",
     "observed",
     "requirements",
+    "scored_mission",
     "sealed",
 }
 

@@ -28,9 +28,7 @@ from fusion_service.recording.drawing.styles import Styles
 from fusion_service.recording.drawing.tables import Table, remember, tabulate
 from schemas import GlobalTracks, LocalTracks
 
-__all__ = [
-    "FocusView",
-]
+__all__ = ["FocusView", "predicted"]
 
 
 AROUND = 5.0

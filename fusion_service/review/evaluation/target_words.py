@@ -11,7 +11,17 @@ from fusion_service.review.evaluation.misses import CAUSES, MERGED
 from fusion_service.review.evaluation.tables import digits, percent
 from fusion_service.review.evaluation.targets import Gap, TargetRecord
 
-__all__ = ["HEAD", "MOST_LINES", "gap_words", "missed_summary", "target_lines", "target_name", "target_table", "why"]
+__all__ = [
+    "HEAD",
+    "LEFT",
+    "MOST_LINES",
+    "gap_words",
+    "missed_summary",
+    "target_lines",
+    "target_name",
+    "target_table",
+    "why",
+]
 
 MOST_LINES = 12
 """Targets of the table on a terminal."""
