@@ -32,6 +32,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "console",
             "troubles",
             "standby",
             "security",

@@ -11,6 +11,7 @@ from types import ModuleType
 
 from fusion_service.commands import (
     check,
+    console,
     demo,
     evaluate,
     explain,
@@ -37,6 +38,7 @@ COMMANDS: dict[str, ModuleType] = {
         keys,
         run,
         status,
+        console,
         listen,
         order,
         record,
