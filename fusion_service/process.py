@@ -7,6 +7,7 @@ Exit codes: 0 done, or stopped by a signal; 2 bad usage or config; 1 any other f
 from __future__ import annotations
 
 import argparse
+import difflib
 import logging
 import math
 import os
@@ -14,13 +15,13 @@ import re
 import signal
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from types import FrameType
-from typing import NoReturn, TextIO, TypeVar, cast
+from typing import Any, NoReturn, TextIO, TypeVar, cast
 
-from fusion_service.escape import Escaped, escaped
+from fusion_service.escape import Escaped, escaped, into_nothing
 
 __all__ = [
     "GRACE",
@@ -29,6 +30,7 @@ __all__ = [
     "data_folder",
     "exit_code",
     "positive",
+    "reader_left",
     "set_up_logging",
     "stop_on_signals",
     "whole",
@@ -107,39 +109,81 @@ def stop_on_signals() -> Iterator[threading.Event]:
 def exit_code(program: str, call: Callable[[], object]) -> int:
     """Call it, and tell on stderr what a person can mend, as `program: ...`; returns what the process ends with.
 
-    What is printed is escaped (`escape`). What is no `FusionError`, no missing package and no trouble with a file is a
-    fault of ours, and raised on.
+    What is printed is escaped (`escape`), and goes nowhere once its reader has gone. What is no `FusionError`, no
+    missing package and no trouble with a file is a fault of ours, and raised on.
     """
     from fusion_service.errors import FusionError  # with NumPy: slow to load, so not before signals are heard
 
     try:
-        with redirect_stdout(cast(TextIO, Escaped(sys.stdout))):
-            call()
+        out = Escaped(sys.stdout)
+        with redirect_stdout(cast(TextIO, out)):
+            try:
+                call()
+            finally:
+                out.flush()
     except FusionError as error:
         if error.exit_code:
             print(escaped(str(error) if error.places else f"{program}: {error}"), file=sys.stderr)
         return error.exit_code
-    except BrokenPipeError:  # whoever read our output has gone; nothing is flushed into it at the end either
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
     except (ImportError, OSError) as error:
         print(escaped(f"{program}: {error}"), file=sys.stderr)
         return 1
     return 0
 
 
+def reader_left() -> bool:
+    """Whether nobody reads what this process prints any more."""
+    return getattr(sys.stdout, "left", False) is True
+
+
 class Parser(argparse.ArgumentParser):
-    """Asks whether the nearest word was meant where one is not among its choices."""
+    """Asks whether the nearest word was meant where one is not among its choices or options, and tells of a command's
+    options with the usage of that command."""
+
+    _given: Sequence[str] = ()
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As in argparse."""
+        self._given = sys.argv[1:] if args is None else list(args)
+        return super().parse_known_args(args, namespace)
+
+    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
+        """As in argparse; what is left over is told of by the command that it was given to."""
+        found, left = self.parse_known_args(args, namespace)
+        if left:
+            command = next((one for word in self._given if (one := self._commands().get(word))), self)
+            command.error(f"unrecognized arguments: {' '.join(left)}{command._meant(left[0])}")
+        return found
 
     def error(self, message: str) -> NoReturn:
         """End with the usage and `message`; exit code 2."""
         if found := re.search(r"invalid choice: '([^']{1,64})' \(choose from (.*)\)", message):
-            import difflib
-
             known = [one.strip(" '") for one in found[2].split(",")]
             if near := difflib.get_close_matches(found[1], known, 1):
                 message = f"{message[: found.end(1) + 1]}: did you mean {near[0]!r}?{message[found.end(1) + 1 :]}"
+        first = self._given[0].partition("=")[0] if self._given else ""
+        if first.startswith("--") and first not in self._option_string_actions:
+            names = [name for name, command in self._commands().items() if first in command._option_string_actions]
+            if names := [name for name in self._given if name in names] or names:
+                message = f"{first} goes behind the command, as in: {self.prog} {names[0]} {first} ..."
         super().error(message)
+
+    def _print_message(self, message: str, file: Any = None) -> None:
+        """To a reader that has gone as well: help goes into a pager."""
+        super()._print_message(message, file)
+        try:
+            (file or sys.stderr).flush()
+        except BrokenPipeError:
+            into_nothing(file or sys.stderr)
+
+    def _commands(self) -> dict[str, Parser]:
+        """The parsers of its commands, by name."""
+        found = [action.choices for action in self._actions if isinstance(action, argparse._SubParsersAction)]
+        return {name: one for some in found for name, one in some.items()}
+
+    def _meant(self, option: str) -> str:
+        near = difflib.get_close_matches(option.partition("=")[0], self._option_string_actions, 1)
+        return f" (did you mean {near[0]}?)" if option.startswith("-") and near else ""
 
 
 def argument(read: Callable[[str], T]) -> Callable[[str], T]:

@@ -15,6 +15,7 @@ from schemas.keys import (
     local_key,
     order_key,
     parse_key,
+    record_key,
     token_key,
     truth_key,
 )
@@ -108,6 +109,7 @@ __all__ = [
     "order_key",
     "pack_lower",
     "parse_key",
+    "record_key",
     "token_key",
     "tracks_at",
     "truth_key",

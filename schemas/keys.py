@@ -4,6 +4,7 @@
 {realm}/v1/global/{centre}/tracks|log|status|alive|picture|orders|state
 {realm}/v1/global/{centre}/orders/{operator}
 {realm}/v1/global/{centre}/holds|yields|standby/{name}
+{realm}/v1/record/{recorder}/alive|state
 {realm}/v1/truth/{scenario}
 """
 
@@ -23,6 +24,7 @@ __all__ = [
     "local_key",
     "order_key",
     "parse_key",
+    "record_key",
     "token_key",
     "truth_key",
 ]
@@ -32,6 +34,7 @@ VERSION = "v1"
 LOCAL = ("tracks", "intensity", "info", "alive")
 CENTRES = "global/"
 GLOBAL = ("tracks", "log", "status", "alive", "picture", "orders", "state")
+RECORD = ("alive", "state")
 TOKENS = ("holds", "yields", "standby")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.:-]{0,63}\Z")
 
@@ -109,6 +112,14 @@ def order_key(centre: str, operator: str, realm: str = REALM) -> str:
     """Key on which an operator gives orders: with certificates nobody else can. `*` stands for any operator. Raises
     ValueError for what is no name or realm."""
     return f"{global_key(centre, 'orders', realm)}/{operator if operator == '*' else check_name(operator)}"
+
+
+def record_key(recorder: str, what: str, realm: str = REALM) -> str:
+    """Key of a recorder; `what` is alive or state. `*` stands for any recorder. Raises ValueError for any other, and
+    for what is no name or realm."""
+    if what not in RECORD:
+        raise ValueError(f"no key of a recorder {what!r} (known: {' '.join(RECORD)})")
+    return f"{check_realm(realm)}/{VERSION}/record/{recorder if recorder == '*' else check_name(recorder)}/{what}"
 
 
 def truth_key(scenario: str, realm: str = REALM) -> str:

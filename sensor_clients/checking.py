@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import threading
 import time
 from collections.abc import Callable
@@ -11,8 +12,8 @@ from typing import Any
 
 import msgpack
 
-from fusion_service.bus import Bus, BusError, Inbox, open_bus
-from fusion_service.bus.security import maybe_security
+from fusion_service.bus import Bus, BusError, Inbox
+from fusion_service.bus.options import joined
 from fusion_service.errors import HealthError, UsageError
 from fusion_service.hints import Listened
 from fusion_service.hints.inspecting import inspect
@@ -22,7 +23,6 @@ from schemas import MessageError, SensorInfo, Status, decode, global_key, local_
 
 __all__ = ["check_file", "check_source"]
 
-HUB = 5.0
 LARGEST = 2**28
 """Bytes of a file that is read."""
 WAITING = 4096
@@ -96,7 +96,7 @@ class _Check:
             return
         found = inspect(data, received, key, self.realm)
         for one in found.findings:
-            self._say(f"WRONG ({one.reason}) {one.said}", (one.reason, one.field))
+            self.say(f"WRONG ({one.reason}) {one.said}", (one.reason, one.field))
         if found.message is None:
             self.unread += 1
             return
@@ -115,9 +115,10 @@ class _Check:
     def doubt(self) -> None:
         """Say what is doubtful now, if it was not said."""
         for one in self.listened.doubts(time.time_ns()):
-            self._say(f"DOUBTFUL {one}", one[:30])
+            self.say(f"DOUBTFUL {one}", one[:30])
 
-    def _say(self, line: str, about: object) -> None:
+    def say(self, line: str, about: object) -> None:
+        """Print a line, once for whatever it is about."""
         known = str(about)
         self.said[known] = self.said.get(known, 0) + 1
         if self.said[known] == 1 and len(self.said) < MOST_SAID:
@@ -134,13 +135,18 @@ class _Check:
             and (time.time_ns() - last["time"]) / 1e9 < RECENT
         ]
 
-    def summary(self, alive: bool) -> list[str]:
-        """What was heard, and what the centres do with it."""
+    def is_there(self, alive: dict[str, bool]) -> bool:
+        """Whether its token stands, by all that do."""
+        return any(held for key, held in alive.items() if self.name in key.split("/"))
+
+    def summary(self, alive: dict[str, bool], itself: bool) -> list[str]:
+        """What was heard, and what the centres do with it. itself: whether the source could be heard."""
         rate = self.listened.rate
         heard = (
             f"heard: {self.tracks} messages with tracks, {self.infos} sensor_info, {self.unread} that cannot be read"
         )
-        lines = [heard + (f"; {rate:.3g} a second" if rate else "") + ("" if alive else "; no liveliness token")]
+        told = heard + (f"; {rate:.3g} a second" if rate else "")
+        lines = [told + ("" if self.is_there(alive) else "; no liveliness token")] if itself else []
         for centre, said in sorted(self.centres.items()):
             if not said:
                 lines.append(f"centre {centre}: has heard nothing of it")
@@ -151,52 +157,82 @@ class _Check:
             last = said.get("last_refusal")
             if isinstance(last, dict):
                 lines.append(f"    refused ({last.get('reason')}, {last.get('count')} times): {last.get('said')}")
+            doubts = said.get("doubts")
+            lines += [f"    DOUBTFUL {one}" for one in doubts] if isinstance(doubts, list) and not itself else []
             lines += [f"    {said['note']}"] if said.get("note") else []
         return lines or ["no centre is there"]
 
 
-def _hear(bus: Bus, name: str, realm: str, take: Callable[[str, bytes], None], alive: dict[str, bool]) -> None:
-    """Hear all of the bus; where a certificate does not let us, the source and the centres in `realm` alone."""
+def _hear(bus: Bus, name: str, realm: str, take: Callable[[str, bytes], None], alive: dict[str, bool]) -> bool:
+    """Hear all of the bus; where a certificate does not let us, the source and the centres in `realm` alone; whether at
+    least the source is heard. Raises `BusError` where not even the centres are."""
     try:
         bus.subscribe("**", take)
         bus.watch("**/v1/local/*/alive", alive.__setitem__)
+        return True
     except BusError:
-        try:
-            for what in ("tracks", "intensity", "info"):
-                bus.subscribe(local_key(name, what, realm), take)
-            bus.watch(local_key(name, "alive", realm), alive.__setitem__)
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+        pass
+    try:
+        keys = [local_key(name, what, realm) for what in ("tracks", "intensity", "info")]
+        token, status = local_key(name, "alive", realm), global_key("*", "status", realm)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+    heard = True
+    try:
+        for key in keys:
+            bus.subscribe(key, take)
+        bus.watch(token, alive.__setitem__)
+    except BusError:
+        heard = False
+    if heard:
         with suppress(BusError):
-            bus.subscribe(global_key("*", "status", realm), take)
+            bus.subscribe(status, take)
+    else:
+        bus.subscribe(status, take)
+    return heard
 
 
-def check_source(
-    name: str, connect: str, realm: str, seconds: float, security: Path | None, stop: threading.Event
-) -> None:
-    """Listen to a source for so many seconds, and print what is wrong as it is heard, then a summary. Raises
-    `HealthError` where something is wrong, or nothing came."""
+def check_source(name: str, args: argparse.Namespace, stop: threading.Event) -> None:
+    """Listen to a source for `args.seconds` on the bus that `args` say (see `bus_options`), and print what is wrong as
+    it is heard, then a summary. Raises `HealthError` where something is wrong, or nothing came."""
     inbox: Inbox[tuple[str, bytes, int]] = Inbox(WAITING)
-    check = _Check(name, realm)
+    check = _Check(name, args.realm)
     alive: dict[str, bool] = {}
-    with open_bus([connect], wait=HUB, stop=stop, security=maybe_security(security)) as bus:
-        _hear(bus, name, realm, lambda key, data: inbox.put(key, (key, data, time.time_ns()), len(data)), alive)
+    with joined(args, stop) as bus:
+        heard = _hear(
+            bus, name, args.realm, lambda key, data: inbox.put(key, (key, data, time.time_ns()), len(data)), alive
+        )
+        if not heard:
+            print("this certificate may not hear sources: what centres say of it is all that is told", flush=True)
         begin = time.monotonic()
-        while not stop.is_set() and time.monotonic() - begin < seconds:
+        while not stop.is_set() and time.monotonic() - begin < args.seconds:
             for _, (key, data, received) in inbox.take(0.1):
                 check.take(key, data, received)
             check.doubt()
-    there = any(held for key, held in alive.items() if name in key.split("/"))
-    if not check.tracks + check.infos + check.unread:
-        near = f" (its token is there: {next(iter(alive))})" if there else ""
-        raise HealthError(f"nothing came of {name} in {seconds:g} s, in any realm{near}: does it publish, at this hub?")
-    if not there and any(name in key.split("/") for key in alive):
-        print("it went while it was listened to: its liveliness token is no more")
-    elif not there:
-        check._say(f"DOUBTFUL it holds no liveliness token: declare one on {realm}/v1/local/{name}/alive", "no token")
-    print("\n".join(check.summary(there)))
+    if heard:
+        _token(check, alive, args)
+    print("\n".join(check.summary(alive, heard)))
     for centre in check.refusing():
         check.said.setdefault(f"refused by {centre}", 1)
+    for centre, said in check.centres.items() if not heard else ():
+        check.said |= {f"{centre} doubts {one}": 1 for one in said.get("doubts") or ()}
     if check.said:
         raise HealthError(f"{len(check.said)} things are wrong with {name}")
     print(f"nothing is wrong with {name}")
+
+
+def _token(check: _Check, alive: dict[str, bool], args: argparse.Namespace) -> None:
+    """Say whether its token is there. Raises `HealthError` where nothing came of it."""
+    name = check.name
+    there = check.is_there(alive)
+    if not check.tracks + check.infos + check.unread:
+        near = f" (its token is there: {next(iter(alive))})" if there else ""
+        raise HealthError(
+            f"nothing came of {name} in {args.seconds:g} s, in any realm{near}: does it publish, at this hub?"
+        )
+    if not there and any(name in key.split("/") for key in alive):
+        print("it went while it was listened to: its liveliness token is no more")
+    elif not there:
+        check.say(
+            f"DOUBTFUL it holds no liveliness token: declare one on {args.realm}/v1/local/{name}/alive", "no token"
+        )

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 from fusion_service import __version__
 from fusion_service.bus import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.bus.options import bus_options
 from fusion_service.errors import UsageError
 from fusion_service.process import Parser, argument, data_folder, exit_code, positive, stop_on_signals, whole
 from schemas import REALM, check_realm
@@ -128,14 +129,7 @@ def _add_check(commands: Any) -> None:
         metavar="S",
         help="listen so long (default 10 s)",
     )
-    checking.add_argument(
-        "--connect",
-        type=argument(check_endpoint),
-        default=DEFAULT_ENDPOINT,
-        help=f"the hub (default {DEFAULT_ENDPOINT})",
-    )
-    checking.add_argument("--security", type=Path, metavar="FILE", help="a certificate that may listen")
-    checking.add_argument("--realm", default=REALM, help=f"first part of every key (default {REALM})")
+    bus_options(checking, "a certificate that may listen: a recorder's, or a viewer's for what centres say of it")
     checking.set_defaults(run=_check)
 
 
@@ -147,7 +141,7 @@ def _check(arguments: argparse.Namespace) -> None:
         check_file(path)
         return
     with stop_on_signals() as stop:
-        check_source(arguments.what, arguments.connect, arguments.realm, arguments.seconds, arguments.security, stop)
+        check_source(arguments.what, arguments, stop)
 
 
 def _command(commands: Any, name: str, text: str, epilog: str) -> argparse.ArgumentParser:

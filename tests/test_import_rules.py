@@ -16,8 +16,20 @@ GROUND_FLOOR = {
     f"fusion_service.{name}"
     for name in (
         *("linalg", "geodesy", "hulls", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
-        *("errors", "arrays", "order", "records", "turn", "ways", "source_words", "layout", "compiled", "escape"),
-        "labels",
+        *(
+            "errors",
+            "arrays",
+            "order",
+            "records",
+            "turn",
+            "ways",
+            "source_words",
+            "layout",
+            "compiled",
+            "escape",
+            "extras",
+            "labels",
+        ),
     )
 }
 STANDS_ON = {
@@ -27,6 +39,7 @@ STANDS_ON = {
     "fusion_service.hints": {*GROUND_FLOOR, "schemas"},
     "fusion_service.rules": {*GROUND_FLOOR, "fusion_service.densities"},
     "fusion_service.bus": {*GROUND_FLOOR, "schemas"},
+    "fusion_service.lookout": {*GROUND_FLOOR, "schemas", "fusion_service.bus", "fusion_service.hints"},
     "fusion_service.config": {*GROUND_FLOOR, "schemas", "fusion_service.rules", "fusion_service.bus.endpoint"},
     "fusion_service.centre": {
         *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.rules", "fusion_service.config"),

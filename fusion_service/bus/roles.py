@@ -9,8 +9,8 @@ token. Who reads may subscribe, look for tokens, and ask publishers for samples 
 |---|---|---|
 | source | `local/{name}/**` | nothing |
 | centre | `global/{name}/**`, queryables `picture`, `orders`, `state` | `local/**`, `global/**`, its own `state` |
-| recorder | nothing | everything but questions and answers |
-| viewer | nothing | `global/**`; asks for `picture` |
+| recorder | `record/{name}/**` | everything but questions and answers |
+| viewer | nothing | `global/**`, `record/**`; asks for `picture`, and recorders for their `state` |
 | operator | nothing | as a viewer; gives orders on `global/*/orders/{name}` alone |
 | gateway | `local/{name}/**` | as a viewer |
 | scenario | `truth/{name}` | nothing: for simulations |
@@ -81,7 +81,9 @@ def hello_key(common: str) -> str:
 def rights(party: Party) -> Rights:
     """What a party may do."""
     role, name = party.role, party.name
-    picture = "global/*/picture"
+    looks = ("global/**", "record/**")
+    asks = ("global/*/picture", "record/*/state")
+    picture = asks[0]
     return {
         "source": Rights(own=(f"local/{name}/**",)),
         "centre": Rights(
@@ -90,10 +92,10 @@ def rights(party: Party) -> Rights:
             ask=(picture, f"global/{name}/state"),
             asked=(picture,),
         ),
-        "recorder": Rights(read=("**",)),
-        "viewer": Rights(read=("global/**",), ask=(picture,)),
-        "operator": Rights(read=("global/**",), ask=(picture, f"global/*/orders/{name}")),
-        "gateway": Rights(own=(f"local/{name}/**",), read=("global/**",), ask=(picture,)),
+        "recorder": Rights(own=(f"record/{name}/**",), read=("**",)),
+        "viewer": Rights(read=looks, ask=asks),
+        "operator": Rights(read=looks, ask=(*asks, f"global/*/orders/{name}")),
+        "gateway": Rights(own=(f"local/{name}/**",), read=looks, ask=asks),
         "scenario": Rights(own=(f"truth/{name}",)),
     }[role]
 

@@ -126,6 +126,11 @@ class Bus:
         info = self._session.info
         return bool(info.routers_zid() or info.peers_zid())
 
+    @property
+    def readable(self) -> tuple[str, ...]:
+        """Key expressions that this party may subscribe to: all, where the hub sets no bounds."""
+        return ("**",) if self._rights is None else tuple(self._rights.get("subscribe", ()))
+
     def _may(self, act: str, key: str) -> AbstractContextManager[None]:
         """Raises `BusError` for what the hub would drop without a word; then as `_readable`."""
         given = None if self._rights is None else self._rights.get(act, ())
@@ -193,6 +198,18 @@ class Bus:
         if on_miss:
             entities.append(subscriber.sample_miss_listener(guard.wrap(missed)))
         return Declaration(self, entities, guard)
+
+    def overhear(self, key_expression: str, callback: Callable[[str, int], None]) -> Declaration:
+        """Call `callback(key, bytes)` for every sample from now on: nobody is asked for what came before or was lost,
+        and publishers do not notice."""
+
+        def receive(sample: Any) -> None:
+            callback(str(sample.key_expr), len(sample.payload))
+
+        guard = _Guard(key_expression)
+        with self._may("subscribe", key_expression):
+            entity = self._session.declare_subscriber(key_expression, guard.wrap(receive))
+        return Declaration(self, [entity], guard)
 
     def announce(self, key: str) -> Declaration:
         """A liveliness token: `watch` elsewhere sees it appear, and go when it is closed or the process dies."""

@@ -26,6 +26,7 @@ from fusion_service.commands import (
     rules,
     run,
     status,
+    top,
     verify,
 )
 
@@ -39,6 +40,7 @@ COMMANDS: dict[str, ModuleType] = {
         run,
         status,
         console,
+        top,
         listen,
         order,
         record,

@@ -9,7 +9,7 @@ from datetime import UTC, datetime
 
 __all__ = ["duration", "moment", "port", "size"]
 
-SIZES = {"b": 1, "": 1} | {
+SIZES = {"b": 1} | {
     f"{prefix}{suffix}": base**power
     for suffix, base in (("b", 1000), ("", 1000), ("ib", 1024))
     for power, prefix in enumerate("kmgt", start=1)
@@ -19,7 +19,9 @@ TEXT = re.compile(r"(\d+(?:\.\d*)?|\.\d+)\s*([a-z]*)", re.ASCII)
 
 
 def size(text: str) -> int:
-    """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500` 500 bytes. Raises ValueError in one line."""
+    """Bytes: `500MB` is 5e8, `500MiB` 500 * 2**20, `500B` 500. Raises ValueError in one line."""
+    if (bare := TEXT.fullmatch(text.strip())) and not bare[2]:
+        raise ValueError(f"{text!r} has no unit: give one, as in {text.strip()}MB, or {text.strip()}B for bytes")
     value = _value(text, SIZES, "a size: give a number and B, kB, MB, GB, TB or KiB, MiB, GiB, as in 500MB")
     return math.ceil(value)
 

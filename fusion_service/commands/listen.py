@@ -6,8 +6,8 @@ import argparse
 import threading
 from typing import Any
 
-from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
-from fusion_service.process import argument, positive, whole
+from fusion_service.bus.options import bus_options, joined
+from fusion_service.process import argument, positive, reader_left, whole
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
@@ -16,8 +16,6 @@ EXAMPLE = """fusion-service listen
   fusion-service listen --source radar-1 --type local_tracks --tracks 3
   fusion-service listen "fusion/v1/local/*/info" --raw
   fusion-service listen --count 1 --for 5 || echo "nobody publishes\""""
-HUB = 5.0
-"""Seconds in which the hub must be there."""
 WAITING = 4096
 """Messages that wait to be printed; more are left out."""
 TYPES = ("local_tracks", "local_intensity", "sensor_info", "global_tracks", "step_log", "status", "truth")
@@ -25,7 +23,7 @@ TYPES = ("local_tracks", "local_intensity", "sensor_info", "global_tracks", "ste
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
-    parser.add_argument("key", nargs="?", default="**", metavar="KEY", help='a key expression (default "**": all)')
+    parser.add_argument("key", nargs="?", metavar="KEY", help="a key expression (default: all that may be heard)")
     parser.add_argument("--raw", action="store_true", help="what is on the wire: the map as JSON, columns in hex")
     parser.add_argument("--source", action="append", metavar="NAME", help="of this source, centre or scenario only")
     parser.add_argument("--type", action="append", choices=TYPES, metavar="TYPE", help=f"only: {', '.join(TYPES)}")
@@ -35,11 +33,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--count", type=argument(whole), default=0, metavar="N", help="end after N messages")
     parser.add_argument("--for", dest="seconds", type=argument(positive), metavar="S", help="end after S seconds")
-    parser.add_argument(
-        "--connect", action="append", type=argument(check_endpoint), metavar="ENDPOINT", help="hub to join"
-    )
-    parser.add_argument("--security", metavar="FILE", help="a certificate that may listen (see `fusion-service keys`)")
-    parser.add_argument("--realm", default="fusion", help="with which keys are compared (default fusion)")
+    bus_options(parser, "a certificate that may listen", "with which keys are compared (default fusion)")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
@@ -47,21 +41,27 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     `SecurityError`."""
     import time
 
-    from fusion_service.bus import Inbox, open_bus
-    from fusion_service.bus.security import maybe_security
+    from fusion_service.bus import Inbox
     from fusion_service.errors import HealthError
     from fusion_service.hints.inspecting import inspect
     from fusion_service.hints.showing import raw_line, shown
 
     inbox: Inbox[tuple[str, bytes, int]] = Inbox(WAITING)
-    security = maybe_security(args.security)
     printed, dropped = 0, 0
-    with open_bus(args.connect or [DEFAULT_ENDPOINT], wait=HUB, stop=stop, security=security) as bus:
-        bus.subscribe(args.key, lambda key, data: inbox.put(key, (key, data, time.time_ns()), len(data)))
+    with joined(args, stop) as bus:
+        keys = [args.key] if args.key else bus.readable
+        if not keys:
+            raise HealthError("this certificate may hear nothing: give that of a recorder, a centre or a viewer")
+        for one in keys:
+            bus.subscribe(one, lambda key, data: inbox.put(key, (key, data, time.time_ns()), len(data)))
         begin = time.monotonic()
-        while not stop.is_set() and (args.seconds is None or time.monotonic() - begin < args.seconds):
+        while (
+            not reader_left()
+            and not stop.is_set()
+            and (args.seconds is None or time.monotonic() - begin < args.seconds)
+        ):
             for _, (key, data, received) in inbox.take(0.1):
-                if stop.is_set() or (args.count and printed >= args.count):
+                if stop.is_set() or reader_left() or (args.count and printed >= args.count):
                     break
                 found = inspect(data, received, key, args.realm)
                 if not _wanted(args, key, data, found):
@@ -75,7 +75,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
                 print(f"({lost - dropped} messages left out: more comes than can be printed)", flush=True)
                 dropped = lost
     if not printed and not stop.is_set():
-        raise HealthError(f"nothing was heard on {args.key}: does anybody publish, at this hub?")
+        raise HealthError(f"nothing was heard on {', '.join(keys)}: does anybody publish, at this hub?")
 
 
 def _wanted(args: argparse.Namespace, key: str, data: bytes, found: Any) -> bool:

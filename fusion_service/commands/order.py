@@ -27,6 +27,7 @@ ANSWER = 10.0
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
+    from fusion_service.bus.options import bus_options
     from fusion_service.commands.arguments import moment
     from fusion_service.order import WHAT
     from fusion_service.process import argument
@@ -61,9 +62,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--why", metavar="TEXT", help="the reason, for the log")
     parser.add_argument("--who", metavar="NAME", help="who orders (default: the user of this computer)")
     parser.add_argument("--centre", default="centre", metavar="NAME", help="name of the centre (default centre)")
-    parser.add_argument("--connect", action="append", metavar="ENDPOINT", help="hub to join")
-    parser.add_argument("--security", metavar="FILE", help="the operator's certificate, whose name is who orders")
-    parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
+    bus_options(parser, "the operator's certificate, whose name is who orders")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:

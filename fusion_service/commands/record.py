@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import threading
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
+from fusion_service.bus.options import bus_options
 from fusion_service.commands.arguments import duration, port, size
 from fusion_service.process import argument
 
@@ -37,20 +39,13 @@ def add(parser: argparse.ArgumentParser) -> None:
         help="recording, a new file; or a folder (a name that ends with /, or exists) of parts, which is gone on with "
         "(default runs/mission-<UTC time>.rrd)",
     )
+    bus_options(parser, "the recorder's certificate, which signs the recording too")
     parser.add_argument(
-        "--connect",
-        action="append",
-        type=argument(check_endpoint),
-        metavar="ENDPOINT",
-        help=f"hub to join (default {DEFAULT_ENDPOINT})",
-    )
-    parser.add_argument(
-        "--security",
-        metavar="FILE",
-        help="the recorder's certificate, which signs the recording too (see `fusion-service keys`)",
+        "--name",
+        metavar="NAME",
+        help="of this recorder, for `status` and `top` (default: its certificate's, or host's)",
     )
     parser.add_argument("--cutoff", type=float, metavar="M", help="largest error that still counts as followed, m")
-    parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
     parser.add_argument(
         "--flush",
         type=argument(duration),
@@ -119,6 +114,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.recording import Rotation, default_path, run_recorder
     from fusion_service.recording.live import DEFAULT_ADDRESS, Live
     from fusion_service.recording.parts import is_folder
+    from fusion_service.recording.presence import Presence, host_name
+    from schemas import check_name
 
     limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
     rotation = None
@@ -128,13 +125,16 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         except ValueError as error:
             raise UsageError(str(error)) from None
     path = Path(args.out) if args.out else default_path(suffix=".rrd" if rotation is None else "")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if path.exists() and (rotation is None or path.is_file()):
-        raise FileExistsError(f"{path} exists already: name another file, or move it away")
+    try:
+        name = check_name(args.name or host_name())
+    except ValueError as error:
+        raise UsageError(f"--name: {error}") from None
+    _check_place(path, folder=rotation is not None, make=not args.out)
     if (args.live or args.live_web) and args.no_draw:
         raise UsageError("--live shows what is drawn: leave out --no-draw")
     security = maybe_security(args.security)
     signer = _signer(args.sign, security)
+    name = security.name if security is not None and not args.name else name
     with ExitStack() as stack:
         live = None
         if args.live or args.live_web:
@@ -153,4 +153,22 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
             signer=signer,
             live=live,
             interval=args.flush,
+            on_tick=Presence(bus, name, path, args.realm).note,
         )
+
+
+def _check_place(path: Path, *, folder: bool, make: bool) -> None:
+    """Before a hub is waited for: that Rerun is there, and that `path`, a file or a `folder` of parts, can be written.
+    make: the folder that it is in, if need be. Raises ImportError, OSError."""
+    from fusion_service.recording.columns import import_rerun
+
+    if path.exists() and (not folder or path.is_file()):
+        raise FileExistsError(f"{path} exists already: name another file, or move it away")
+    if make:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"{path.parent} is no folder that exists: make it, or name another place with --out")
+    place = path if path.is_dir() else path.parent
+    if not os.access(place, os.W_OK | os.X_OK):
+        raise PermissionError(f"{place} cannot be written: name another place with --out, or mend its owner and mode")
+    import_rerun()

@@ -6,7 +6,7 @@ import argparse
 import threading
 from typing import Any
 
-from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.bus.options import PATIENCE, bus_options, joined
 from fusion_service.process import argument, positive
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
@@ -15,16 +15,21 @@ HELP = "How a running centre and its sources are, and what is wrong: 0 all is we
 EXAMPLE = """fusion-service status
   fusion-service status --json | jq '.centres[].sources'
   fusion-service status --centre north --for 10 || echo "see to it"
-  fusion-service status --security keys/display-wall"""
-HUB = 5.0
-"""Seconds in which the hub must be there."""
-MOST_KEYS = 200
+  fusion-service status --ignore 'spare-*' --ignore radar7        gone, and meant to be
+  fusion-service status --security keys/viewer-wall"""
 
 
 def add(parser: argparse.ArgumentParser) -> None:
     """The arguments."""
     parser.add_argument("--centre", metavar="NAME", help="of this centre only (default: all of the realm)")
     parser.add_argument("--json", action="store_true", help="as JSON, for scripts")
+    parser.add_argument(
+        "--ignore",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a source whose faults do not count; * stands for any letters; several times",
+    )
     parser.add_argument(
         "--for",
         dest="seconds",
@@ -33,11 +38,7 @@ def add(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="how long it listens, s (default 2.5); whoever publishes less often on a wrong key is not heard",
     )
-    parser.add_argument(
-        "--connect", action="append", type=argument(check_endpoint), metavar="ENDPOINT", help="hub to join"
-    )
-    parser.add_argument("--security", metavar="FILE", help="a certificate that may listen (see `fusion-service keys`)")
-    parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
+    bus_options(parser, "a certificate that may listen: a viewer's")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
@@ -46,107 +47,42 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     import json
     import time
 
-    from fusion_service.bus import open_bus
-    from fusion_service.bus.security import maybe_security
-    from fusion_service.errors import HealthError, UsageError
-    from fusion_service.hints.health import health_of
-    from schemas import global_key
+    from fusion_service.errors import HealthError
+    from fusion_service.lookout.ear import Ear
+    from fusion_service.lookout.view import view_of
 
-    try:
-        names = [global_key(args.centre or "*", what, args.realm) for what in ("status", "tracks")]
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    ear = _Ear()
-    security = maybe_security(args.security)
-    with open_bus(args.connect or [DEFAULT_ENDPOINT], wait=HUB, stop=stop, security=security) as bus:
-        for key in names:
-            bus.subscribe(key, ear.take)
-        everywhere = ear.overhear(bus)
+    ear = Ear(args.realm)
+    with joined(args, stop) as bus:
+        ear.hear(bus, args.centre or "*")
         begin = time.monotonic()
-        while not stop.is_set() and time.monotonic() - begin < args.seconds + HUB:
+        while not stop.is_set() and time.monotonic() - begin < args.seconds + PATIENCE:
             stop.wait(0.05)
             if ear.statuses and time.monotonic() - begin >= args.seconds:
                 break
-    now = time.time_ns()
-    healths = [health_of(status, ear.pictures.get(name), now) for name, status in sorted(ear.statuses.items())]
-    beside = ear.beside(args.realm)
-    wrong = [*ear.twice(), *(line for health in healths for line in health.wrong), *beside]
-    if not healths:
-        who = f"no centre named {args.centre}" if args.centre else f"no centre of the realm {args.realm}"
-        wrong.insert(0, f"{who} answers: is `fusion-service run` there, under this name?")
+        ear.ask(bus)
+        view = view_of(ear, time.time_ns(), centre=args.centre or "", ignored=args.ignore)
     if args.json:
-        said = {"well": not wrong, "wrong": wrong, "beside": beside, "centres": [health.data for health in healths]}
+        said = {
+            "well": not view.wrong,
+            "wrong": view.wrong,
+            "beside": view.beside,
+            "centres": [one.health.data for one in view.centres],
+            "recorders": [{"name": one.name, **one.said, "wrong": one.wrong} for one in view.keepers],
+        }
         print(json.dumps(said, indent=1, default=_plain))
     else:
-        for health in healths:
-            print("\n".join(health.lines))
-        for line in ear.twice():
+        for one in view.centres:
+            print("\n".join(one.health.lines))
+        print("\n".join(one.line for one in view.keepers) or "recorder: none is there, nothing is kept")
+        for line in view.twice:
             print(line)
-        for line in beside:
+        for line in view.beside:
             print(f"beside: {line}")
-        if not everywhere:
+        if not view.everywhere:
             print("only this realm was heard: the certificate lets in no more")
-    if wrong:
+    if view.wrong:
+        wrong = view.wrong
         raise HealthError(wrong[0] if len(wrong) == 1 else f"{len(wrong)} things are wrong; the first: {wrong[0]}")
-
-
-class _Ear:
-    """Keeps the newest statuses and pictures by centre, and the keys that anybody publishes on."""
-
-    def __init__(self) -> None:
-        self.statuses: dict[str, Any] = {}
-        self.pictures: dict[str, Any] = {}
-        self._runs: dict[str, dict[int, int]] = {}
-        self._keys: dict[str, None] = {}
-
-    def take(self, key: str, data: bytes) -> None:
-        """A message of a centre, on a thread of the bus."""
-        from schemas import GlobalTracks, MessageError, Status, decode
-
-        try:
-            message = decode(data)
-        except MessageError:
-            return
-        if isinstance(message, Status):
-            self.statuses[message.source] = message
-            runs = self._runs.setdefault(message.source, {})
-            runs[message.epoch] = runs.get(message.epoch, 0) + 1
-        elif isinstance(message, GlobalTracks) and not message.delta:
-            self.pictures[message.source] = message
-
-    def twice(self) -> list[str]:
-        """Centres of which two processes publish at once."""
-        return [
-            f"{len(runs)} processes publish as centre {name}: end one of them, or let it stand by (run --standby)"
-            for name, runs in sorted(self._runs.items())
-            if sum(count > 1 for count in runs.values()) > 1
-        ]
-
-    def overhear(self, bus: Any) -> bool:
-        """Hear on which keys anybody publishes; whether that is allowed."""
-        from fusion_service.bus import BusError
-
-        try:
-            bus.subscribe("**", self._overheard, history=0)
-            bus.watch("**/v1/local/*/alive", lambda key, alive: self._overheard(key, b""))
-        except BusError:
-            return False
-        return True
-
-    def _overheard(self, key: str, data: bytes) -> None:
-        if len(self._keys) < MOST_KEYS:
-            self._keys[key] = None
-
-    def beside(self, realm: str) -> list[str]:
-        """What is published where no centre of `realm` listens."""
-        from fusion_service.hints import key_finding
-
-        found = []
-        for key in sorted(self._keys):
-            odd = key_finding(key, realm)
-            if odd is not None:
-                found.append(odd.said if odd.reason == "key" else f"{key}: {odd.said}")
-        return found
 
 
 def _plain(value: Any) -> Any:

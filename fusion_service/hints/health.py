@@ -1,9 +1,14 @@
-"""What a centre's status says of how all goes, as lines for people, data for scripts, and a list of what is wrong."""
+"""What a centre's status says of how all goes: a row a source, figures, alarms; as lines for people, data for scripts.
+
+`status` prints the lines, `top` draws the rows; what counts as wrong is said here alone.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,21 +18,65 @@ from fusion_service.hints.times import span
 from fusion_service.source_words import source_health, state_of
 from schemas import GlobalTracks, Status
 
-__all__ = ["Health", "health_of", "linked_shares"]
+__all__ = ["STATES", "Health", "Row", "health_of", "linked_shares", "row_line"]
 
 OLD = 3.5
 """Seconds after which a status should have been followed by another."""
 RECENT = 60.0
 """Seconds for which a refusal counts as one of now."""
 MOST_LINES = 200
+STATES = {
+    "gone": "its liveliness token is no more",
+    "refused": "it sends, and nothing of it is taken",
+    "silent": "it is there, but its newest tracks are stale",
+    "unheard": "its token is there, but nothing came of it yet",
+    "resting": "it has been silent for long, and costs nothing until it speaks",
+    "muted": "an order, or the config, has all that it sends refused",
+    "there": "it sends",
+}
+"""How a source can be, and what that means; the first is the most urgent."""
+BENIGN = ("repeat", "muted")
+"""Reasons of refusals in which nothing is wrong."""
+
+
+class Row(NamedTuple):
+    """A source. state: one of `STATES`; trust: as supervision says, or ""; rate: messages a second; period: declared,
+    s; latency, clock: s; share: of its tracks that others have too; refused: messages and tracks, since the start;
+    gaps: lost ones; reason: of its last refusal, where that was lately; faults: what is wrong, a sentence each; more:
+    what else is known of it; ignored: its faults do not count."""
+
+    name: str
+    state: str
+    trust: str
+    rate: float | None
+    period: float | None
+    latency: float | None
+    clock: float | None
+    tracks: int | None
+    share: float | None
+    refused: int
+    gaps: int
+    reason: str
+    faults: tuple[str, ...]
+    more: tuple[str, ...]
+    ignored: bool
+
+    @property
+    def urgency(self) -> tuple[int, int, str]:
+        """Those that are in trouble sort first, those that rest last."""
+        troubled = bool(self.faults) and not self.ignored
+        return (0 if troubled else 2 if self.state in ("resting", "muted") else 1), -len(self.faults), self.name
 
 
 class Health(NamedTuple):
-    """Of one centre: lines to be read, data to be processed, and what is wrong, a sentence each."""
+    """Of one centre: lines to be read, data to be processed, what is wrong, a sentence each; its sources, and how many
+    more there are."""
 
     lines: list[str]
     data: dict[str, Any]
     wrong: list[str]
+    rows: list[Row]
+    beyond: int
 
 
 def linked_shares(picture: GlobalTracks) -> dict[str, int]:
@@ -41,24 +90,45 @@ def linked_shares(picture: GlobalTracks) -> dict[str, int]:
     return {name: shared[k] for k, name in enumerate(picture.sources)}
 
 
-def health_of(status: Status, picture: GlobalTracks | None, now: int) -> Health:
-    """Of a centre by its newest status and picture, at `now`, ns."""
-    wrong = _process(status, now)
+def health_of(status: Status, picture: GlobalTracks | None, now: int, ignored: Sequence[str] = ()) -> Health:
+    """Of a centre by its newest status and picture, at `now`, ns. ignored: patterns of names of sources whose faults
+    do not count."""
     shared = linked_shares(picture) if picture is not None else {}
-    sources: dict[str, dict[str, Any]] = {}
-    lines = []
+    rows, beyond = [], 0
     for name, said in sorted(status.sources.items()):
         if name == "*":
-            lines.append(f"  and {said.get('more')} sources more")
-            continue
-        faults = _faults(said, now)
-        wrong += [f"{name}: {fault}" for fault in faults]
-        sources[name] = _data(said, shared.get(name)) | {"wrong": faults}
-        lines.append(_line(name, sources[name]))
-        lines += [f"      {fault}" for fault in faults]
-        lines += [f"      ({one})" for one in source_health(said) if not any(one in fault for fault in faults)]
+            more = said.get("more")
+            beyond = more if isinstance(more, int) else 0
+        else:
+            rows.append(_row(name, said, shared.get(name), now, any(fnmatchcase(name, one) for one in ignored)))
     apart = offset_doubts(picture) if picture is not None else []
+    apart = [one for one in apart if not any(row.ignored and row.name in one for row in rows)]
+    wrong = _process(status, now)
+    wrong += [f"{row.name}: {fault}" for row in rows if not row.ignored for fault in row.faults]
     wrong += apart
+    lines = [line for row in rows for line in _lines(row)] + ([f"  and {beyond} sources more"] if beyond else [])
+    said = status.sources
+    data = {
+        "centre": status.source,
+        "age": (now - status.sent) / 1e9,
+        "uptime": status.uptime,
+        "step": status.step,
+        "tracks": status.tracks,
+        "rates": status.rates,
+        "queue": status.queue,
+        "step_time": status.step_time,
+        "refused": status.refused,
+        "dropped": status.dropped,
+        "notes": list(status.notes or ()),
+        "standby": status.standby,
+        "sources": {row.name: {**said[row.name], **_data(row)} for row in rows},
+        "wrong": wrong,
+    }
+    return Health([*_head(status), *(f"  {one}" for one in apart), *lines[:MOST_LINES]], data, wrong, rows, beyond)
+
+
+def _head(status: Status) -> list[str]:
+    """What there is to say of the centre itself."""
     tracks = ", ".join(f"{count} {name}" for name, count in status.tracks.items()) or "none yet"
     queue, steps = status.queue, status.step_time
     head = [
@@ -73,25 +143,7 @@ def health_of(status: Status, picture: GlobalTracks | None, now: int) -> Health:
     standby = status.standby or {}
     if standby.get("there"):
         head.append(f"  {standby['there']} stand by, {standby.get('ready', 0)} ready")
-    head += [f"  note: {note}" for note in status.notes or ()]
-    head += [f"  {one}" for one in apart]
-    data = {
-        "centre": status.source,
-        "age": (now - status.sent) / 1e9,
-        "uptime": status.uptime,
-        "step": status.step,
-        "tracks": status.tracks,
-        "rates": status.rates,
-        "queue": queue,
-        "step_time": steps,
-        "refused": status.refused,
-        "dropped": status.dropped,
-        "notes": list(status.notes or ()),
-        "standby": status.standby,
-        "sources": sources,
-        "wrong": wrong,
-    }
-    return Health([*head, *lines[:MOST_LINES]], data, wrong)
+    return head + [f"  note: {note}" for note in status.notes or ()]
 
 
 def _process(status: Status, now: int) -> list[str]:
@@ -118,53 +170,121 @@ def _process(status: Status, now: int) -> list[str]:
     return found
 
 
-def _faults(said: Mapping[str, Any], now: int) -> list[str]:
-    """What is wrong with a source."""
-    found = []
+def _row(name: str, said: Mapping[str, Any], shared: int | None, now: int, ignored: bool) -> Row:
+    tracks = said.get("tracks")
+    tracks = tracks if isinstance(tracks, int) and not isinstance(tracks, bool) else None
+    last, refused = said.get("last_refusal"), said.get("refused")
+    recent = isinstance(last, Mapping) and isinstance(when := last.get("time"), int) and (now - when) / 1e9 < RECENT
+    newest = last if recent and isinstance(last, Mapping) else {}
+    state = _state(said, newest)
+    faults = _faults(said, state, newest)
+    counts = [one for one in refused.values() if isinstance(one, int)] if isinstance(refused, Mapping) else []
+    return Row(
+        name,
+        state,
+        state_of(said),
+        _number(said, "rate"),
+        _number(said, "declared_period"),
+        _number(said, "latency"),
+        _number(said, "clock"),
+        tracks,
+        min(shared / tracks, 1.0) if shared is not None and tracks else None,
+        sum(counts) or (_count(last) if isinstance(last, Mapping) else 0),
+        round(_number(said, "gaps") or 0),
+        str(newest.get("reason", "")),
+        tuple(faults),
+        tuple(one for one in _more(said, state) if not any(one in fault for fault in faults)),
+        ignored,
+    )
+
+
+def _state(said: Mapping[str, Any], last: Mapping[str, Any]) -> str:
+    """Which of `STATES` a source is in. last: its last refusal, if that was lately."""
     if said.get("alive") is False:
+        return "gone"
+    if said.get("muted") is True:
+        return "muted"
+    if said.get("alive") is True and not said.get("messages") and not said.get("last_refusal"):
+        return "unheard"
+    if last and (said.get("stale") or not said.get("messages")):
+        return "refused"
+    if said.get("resting") is True:
+        return "resting"
+    return "silent" if said.get("stale") and said.get("messages") else "there"
+
+
+def _faults(said: Mapping[str, Any], state: str, last: Mapping[str, Any]) -> list[str]:
+    """What is wrong with a source. last: its last refusal, if that was lately."""
+    found = []
+    if state == "gone":
         found.append("it is gone: its liveliness token is no more")
-    elif said.get("stale") is True and said.get("messages"):
-        found.append("it is silent: its newest tracks are stale")
-    last = said.get("last_refusal")
-    if isinstance(last, Mapping) and last.get("reason") not in ("repeat", "muted"):
-        when = last.get("time")
-        if isinstance(when, int) and (now - when) / 1e9 < RECENT:
-            found.append(f"refused ({last.get('reason')}, {last.get('count')} times): {last.get('said')}")
+    if last and last.get("reason") not in BENIGN:
+        found.append(f"refused ({last.get('reason')}, {_count(last)} times): {last.get('said')}")
+    if state == "silent" or (state == "resting" and said.get("messages")):
+        found.append("it is silent: its newest tracks are stale" + "; it rests" * (state == "resting"))
+    elif state == "unheard":
+        found.append("its token is there, but no message of it came: on which keys does it publish?")
     doubts = said.get("doubts")
     found += [str(one) for one in doubts] if isinstance(doubts, (list, tuple)) else []
     note = said.get("note")
     found += [note] if isinstance(note, str) and note and said.get("unused") else []
-    state, alarms = state_of(said), said.get("alarms")
-    if state not in ("", "trusted"):
-        found.append(f"it is not trusted ({state}): {said.get('state_why', '')}")
+    trust, alarms = state_of(said), said.get("alarms")
+    if trust not in ("", "trusted"):
+        found.append(f"it is not trusted ({trust}): {said.get('state_why', '')}")
     return [*found, *(str(one) for one in (alarms if isinstance(alarms, (list, tuple)) else ()))]
 
 
-def _data(said: Mapping[str, Any], shared: int | None) -> dict[str, Any]:
-    """A source for scripts: what the status says, and how many of its tracks others share."""
-    tracks = said.get("tracks")
-    share = shared / tracks if shared is not None and isinstance(tracks, int) and tracks else None
-    return {**said, "linked_share": None if share is None else min(share, 1.0)}
+def _more(said: Mapping[str, Any], state: str) -> list[str]:
+    """What else is known of a source that a person should read."""
+    last, lines = said.get("last_refusal"), []
+    if isinstance(last, Mapping) and last.get("reason") in BENIGN:
+        lines.append(f"refused ({last.get('reason')}, {_count(last)} times): {last.get('said')}")
+    return [*([STATES[state]] if state in ("resting", "muted") else []), *lines, *source_health(said)]
 
 
-def _line(name: str, said: Mapping[str, Any]) -> str:
+def _count(last: Mapping[str, Any]) -> int:
+    count = last.get("count")
+    return count if isinstance(count, int) and not isinstance(count, bool) else 1
+
+
+def _number(said: Mapping[str, Any], key: str) -> float | None:
+    value = said.get(key)
+    if not isinstance(value, (int, float)) or isinstance(value, bool) or not math.isfinite(value):
+        return None
+    return float(value)
+
+
+def _data(row: Row) -> dict[str, Any]:
+    """What a row adds to what the status says of a source, for scripts."""
+    return {"is": row.state, "linked_share": row.share, "wrong": list(row.faults), "ignored": row.ignored}
+
+
+def _lines(row: Row) -> list[str]:
+    """A source in lines: how it is, what is wrong with it, and what else there is to know."""
+    ignored = " (ignored)" if row.ignored and row.faults else ""
+    return [
+        f"  {row_line(row)}{ignored}",
+        *(f"      {fault}" for fault in row.faults if not row.ignored),
+        *(f"      ({one})" for one in row.more),
+    ]
+
+
+def row_line(row: Row) -> str:
     """A source in a line."""
 
-    def number(key: str, form: str, words: str) -> str:
-        value = said.get(key)
-        good = isinstance(value, (int, float)) and not isinstance(value, bool)
-        return words.format(format(value, form)) if good else ""
+    def number(value: float | None, form: str, words: str) -> str:
+        return "" if value is None else words.format(format(value, form))
 
-    state = "gone" if said.get("alive") is False else "silent" if said.get("stale") else "there"
-    rate = number("rate", ".3g", "{} a second")
-    declared = number("declared_period", ".3g", "of one every {} s")
+    rate = number(row.rate, ".3g", "{} a second")
+    period = number(row.period, ".3g", "of one every {} s")
     parts = [
-        str(said.get("state") or ""),
-        f"{rate} {declared}".strip() if rate else "",
-        number("tracks", "d", "{} tracks"),
-        number("linked_share", ".0%", "{} shared with others"),
-        number("latency", ".3g", "latency {} s"),
-        number("clock", "+.2g", "clock {} s"),
-        number("gaps", "d", "{} lost"),
+        row.trust,
+        f"{rate} {period}".strip() if rate else "",
+        number(row.tracks, "d", "{} tracks"),
+        number(row.share, ".0%", "{} shared with others"),
+        "" if row.latency is None else f"latency {span(row.latency)}",
+        number(row.clock, "+.2g", "clock {} s"),
+        f"{row.refused} refused" if row.refused else "",
+        f"{row.gaps} lost" if row.gaps else "",
     ]
-    return f"  {name:<16} {state:<7}" + ", ".join(part for part in parts if part and part != "0 lost")
+    return f"{row.name:<16} {row.state:<8}" + ", ".join(part for part in parts if part)

@@ -94,6 +94,7 @@ class Recorder:
         self.messages = 0
         self.bytes = 0
         self.undecodable: Counter[str] = Counter()
+        self.missing = 0
         self._prefix = f"{check_realm(realm)}/v1/"
         self._trail = trail
         self._draw = draw
@@ -186,6 +187,7 @@ class Recorder:
 
     def lost(self, key: str, count: int, received: int) -> None:
         """Note that `count` messages on `key` were lost on their way here."""
+        self.missing += count
         self._say(f"{count} messages on {key} were lost", received)
 
     def tick(self) -> None:

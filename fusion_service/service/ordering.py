@@ -11,7 +11,6 @@ none, or {"what": "list"}           -> {"orders": [...], "time": ns}: the orders
 
 from __future__ import annotations
 
-import re
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -19,15 +18,14 @@ from typing import Any, NamedTuple
 
 import msgpack
 import numpy as np
-from numpy.typing import NDArray
 
 from fusion_service.centre import NEEDED, WHAT, Centre, Order, View, judge, read_order
 from fusion_service.service.promises import Promises, Reply
+from fusion_service.service.suggesting import advised, find_track, suggestion
 from schemas import check_name, check_source
 
 __all__ = ["OrderDesk"]
 
-COUNTERS = 2**32
 MOST_BYTES = 64_000
 MOST_FOR = 1e9
 
@@ -98,13 +96,14 @@ class OrderDesk:
             order = self._read(dict(raw), view)
             if not order.refused:
                 outcome = judge(order, view)
-                order = order if outcome.done else replace(order, refused=outcome.text)
-            else:
+                if not outcome.done:
+                    order = replace(order, refused=f"{outcome.text}{suggestion(order, view)}")
+            if order.refused:
                 outcome = judge(order, view)
             order = replace(order, number=self._next)
             self._next += 1
         if outcome.done:
-            self.promises.make(order, outcome.text, reply)
+            self.promises.make(order, outcome.text, advised(order, view, reply))
         self._put(order)
         if not outcome.done:
             refusal = {"number": order.number, "done": False, "outcome": outcome.text, "track": order.track}
@@ -136,29 +135,6 @@ class OrderDesk:
                 raise ValueError("the order's for: must be seconds above 0")
             raw["until"] = max(view.time, 0) + round(seconds * 1e9)
         return read_order({**raw, "number": None, "refused": refused or None})
-
-
-def find_track(name: Any, view: View) -> int:
-    """The global id that a whole id, a number or callsign given by an order, or the short number of a recording (7,
-    2.7) names. `LookupError` in one line where it is none, or several."""
-    text = str(name).strip()
-    for one in view.standing.values() if text else ():
-        if one.order.what == "rename" and text in (one.order.name, str(one.order.shown or "")) and one.order.track:
-            return one.order.track
-    match = re.fullmatch(r"(?:(\d{1,10})\.)?(\d{1,20})", text, flags=re.ASCII)
-    ids: NDArray[np.uint64] = view.ids
-    found = ids[:0]
-    if match and int(match[2]) < 2**64:
-        number = int(match[2])
-        found = ids[ids == np.uint64(number)] if not match[1] else found
-        if not len(found) and number < COUNTERS:
-            found = ids[ids % np.uint64(COUNTERS) == np.uint64(number)]
-    if len(found) == 1:
-        return int(found[0])
-    known = ", ".join(str(one) for one in (found if len(found) else ids)[:8].tolist()) or "none"
-    if len(found):
-        raise LookupError(f"{text} is several tracks: {known}: give the whole id")
-    raise LookupError(f"there is no track {text}: known are {known}" + (" ..." if len(ids) > 8 else ""))
 
 
 def _map(payload: bytes | None) -> Mapping[str, Any]:

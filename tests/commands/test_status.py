@@ -120,15 +120,15 @@ def test_listen_says_what_is_wrong_and_that_nothing_came(scene: Scene, capsys: p
 def test_a_hub_that_is_not_there_is_one_line(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("fusion_service.commands.status.HUB", 0.2)
+    monkeypatch.setattr("fusion_service.bus.options.PATIENCE", 0.2)
     assert main(["status", "--connect", free_endpoint()]) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_two_processes_that_publish_as_one_centre_are_told_of() -> None:
-    from fusion_service.commands.status import _Ear
+    from fusion_service.lookout.ear import Ear
 
-    ear = _Ear()
+    ear = Ear("fusion")
     for seq in range(2):
         for epoch in (1, 2):
             status = schemas.Status(

@@ -1,0 +1,1 @@
+"""What is seen of running centres from the bus alone: `status` and `top` stand on it."""
