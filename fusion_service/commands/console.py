@@ -5,7 +5,8 @@ from __future__ import annotations
 import argparse
 import threading
 
-from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
+from fusion_service.bus.options import bus_options
 from fusion_service.process import argument
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
@@ -52,13 +53,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--token-file", metavar="FILE", help="file that holds the token (default: a new one every time)"
     )
-    parser.add_argument(
-        "--connect", action="append", type=argument(check_endpoint), metavar="ENDPOINT", help="hub to join"
-    )
-    parser.add_argument(
-        "--security", metavar="FILE", help="a viewer's certificate, or an operator's, whose name is who orders"
-    )
-    parser.add_argument("--realm", default="fusion", help="first part of every key (default fusion)")
+    bus_options(parser, "a viewer's certificate, or an operator's, whose name is who orders")
 
 
 def run(args: argparse.Namespace, stop: threading.Event) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hmac
 import ipaddress
+import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -114,8 +115,8 @@ class Guard:
             (b"cache-control", b"no-cache"),
         ]
         if refusal:
-            body = f"{refusal}\n".encode()
-            kept += [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
+            body = json.dumps({"wrong": refusal}).encode()
+            kept += [(b"content-type", b"application/json"), (b"content-length", str(len(body)).encode())]
             await send({"type": "http.response.start", "status": 403, "headers": kept})
             await send({"type": "http.response.body", "body": body})
             return

@@ -10,8 +10,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fusion_service.colours import source_colours
-from fusion_service.hints.health import health_of
-from fusion_service.source_words import state_of
+from fusion_service.hints.health import STATES, Row, health_of
 from schemas import GlobalTracks, Status
 
 __all__ = ["Alarms", "health"]
@@ -20,7 +19,6 @@ MOST_SOURCES = 300
 MOST_ALARMS = 200
 LONGEST = 400
 NUMBER = re.compile(r"[-+]?\d[\d.,]*(e[-+]?\d+)?")
-FIGURES = ("rate", "declared_period", "latency", "clock", "tracks", "linked_share", "messages", "gaps", "offset")
 
 
 class Alarms:
@@ -40,9 +38,8 @@ class Alarms:
 def health(status: Status, picture: GlobalTracks | None, now: int, alarms: Alarms) -> dict[str, Any]:
     """The message of a centre's health at `now`, ns."""
     found = health_of(status, picture, now)
-    told: Mapping[str, Mapping[str, Any]] = found.data["sources"]
-    names = [name for name in told if name != "*"]
-    colours = source_colours(names)
+    colours = source_colours(row.name for row in found.rows)
+    rows = sorted(found.rows, key=lambda row: row.urgency)[:MOST_SOURCES]
     steps = status.step_time
     figures = {
         "up": status.uptime,
@@ -60,38 +57,39 @@ def health(status: Status, picture: GlobalTracks | None, now: int, alarms: Alarm
         "type": "health",
         "figures": figures,
         "notes": [note[:LONGEST] for note in (status.notes or ())[:20]],
-        "sources": [_source(name, told[name], colours[name]) for name in names[:MOST_SOURCES]],
-        "beyond": max(len(names) - MOST_SOURCES, 0),
+        "sources": [_source(row, status.sources[row.name], colours[row.name]) for row in rows],
+        "beyond": found.beyond + len(found.rows) - len(rows),
         "alarms": alarms.of(found.wrong, now // 10**6),
     }
 
 
-def _source(name: str, said: Mapping[str, Any], colour: str) -> dict[str, Any]:
-    """A source: its state, figures, what is wrong, and its last refusal with the remedy."""
+def _source(row: Row, said: Mapping[str, Any], colour: str) -> dict[str, Any]:
+    """A source: its state, figures, what is wrong and what else is known, and its last refusal with the remedy."""
     last = said.get("last_refusal")
     refusal = None
     if isinstance(last, Mapping):
-        when = last.get("time")
+        when, count = last.get("time"), last.get("count")
         refusal = {
             "reason": str(last.get("reason"))[:60],
-            "count": last.get("count"),
+            "count": count if isinstance(count, int) else None,
             "said": str(last.get("said"))[:LONGEST],
             "time": when // 10**6 if isinstance(when, int) else None,
         }
-    gone, stale = said.get("alive") is False, said.get("stale") is True
-    state = (said.get("muted") is True and "muted") or (gone and "gone") or (stale and "silent") or "there"
-    wrong = said.get("wrong")
     return {
-        "name": name,
+        "name": row.name,
         "colour": colour,
-        "state": state,
-        "trust": state_of(said),
-        "wrong": [str(one)[:LONGEST] for one in wrong[:10]] if isinstance(wrong, (list, tuple)) else [],
+        "state": row.state,
+        "means": STATES[row.state],
+        "trust": row.trust,
+        "rate": row.rate,
+        "period": row.period,
+        "latency": row.latency,
+        "clock": row.clock,
+        "tracks": row.tracks,
+        "share": row.share,
+        "refused": row.refused,
+        "gaps": row.gaps,
+        "wrong": [one[:LONGEST] for one in row.faults[:10]],
+        "more": [one[:LONGEST] for one in row.more[:10]],
         "refusal": refusal,
-        **{key: _figure(said.get(key)) for key in FIGURES},
     }
-
-
-def _figure(value: Any) -> float | None:
-    """A number, or nothing."""
-    return float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else None

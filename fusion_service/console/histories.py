@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from fusion_service.console.events import event_words, local_words, short
 from fusion_service.labels import Labels
 from fusion_service.order import giver_of
 from fusion_service.source_words import source_event
@@ -131,22 +132,21 @@ class Histories:
         elif (said := source_event(event)) is not None:
             self.say(at, "event", f"{source}: {said[1]}", said[0])
         else:
-            rest = ", ".join(f"{key} {_short(value)}" for key, value in event.items() if key not in ("kind", "epoch"))
-            self.say(at, "event", f"{kind.replace('_', ' ')}{f' ({rest})' if rest else ''}")
+            self.say(at, "event", event_words(kind, event, at))
 
     def _order(self, event: Mapping[str, Any], at: int) -> None:
         """An order that a step obeyed, or refused, with who gave it."""
         about = [event.get(name) for name in ("track", "other")]
         tracks = [one for one in about if type(one) is int]
         whom = [f"track {self._label(one)}" for one in tracks]
-        whom += [_local(event[name]) for name in ("local", "against") if event.get(name)]
-        whom += [_short(event[name]) for name in ("source", "name", "shown", "identity", "state") if event.get(name)]
-        who = giver_of(_short(event.get("who") or ""), event.get("proven") is True)
-        why = f" ({_short(event['why'])})" if event.get("why") else ""
+        whom += [local_words(event[name]) for name in ("local", "against") if event.get(name)]
+        whom += [short(event[name]) for name in ("source", "name", "shown", "identity", "state") if event.get(name)]
+        who = giver_of(short(event.get("who") or ""), event.get("proven") is True)
+        why = f" ({short(event['why'])})" if event.get("why") else ""
         done = event.get("done") is not False
-        outcome = f": {_short(event['outcome'])}" if event.get("outcome") else ""
+        outcome = f": {short(event['outcome'])}" if event.get("outcome") else ""
         words = (
-            f"order {_short(event.get('what'))} {', '.join(whom)} by {who}{why}{'' if done else ', refused'}{outcome}"
+            f"order {short(event.get('what'))} {', '.join(whom)} by {who}{why}{'' if done else ', refused'}{outcome}"
         )
         self.say(at, "order", words, not done, tracks[0] if tracks else None)
         for track in tracks:
@@ -206,11 +206,3 @@ def _member(log: StepLog, row: int) -> tuple[str, int, int] | None:
 def _plain(text: str) -> str:
     """A text in which no brace means anything."""
     return text.replace("{", "{{").replace("}", "}}")
-
-
-def _local(value: Any) -> str:
-    return f"{_short(value[0])} {_short(value[2])}" if isinstance(value, (list, tuple)) and len(value) == 3 else ""
-
-
-def _short(value: Any) -> str:
-    return f"{len(value)} bytes" if isinstance(value, bytes) else str(value)[:120]

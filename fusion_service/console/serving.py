@@ -19,6 +19,7 @@ from fusion_service.console.listening import Listener
 from fusion_service.console.ordering import orders_offered
 from fusion_service.console.state import State
 from fusion_service.errors import UsageError
+from fusion_service.extras import install_hint
 
 __all__ = ["ConsoleOptions", "run_console"]
 
@@ -27,7 +28,6 @@ log = logging.getLogger(__name__)
 CONNECTIONS = 64
 """Connections at a time."""
 LEAST_TOKEN = 16
-EXTRA = "the console needs a web server: pip install 'track-fusion-centre[console]'"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def run_console(options: ConsoleOptions, stop: threading.Event) -> None:
 
         from fusion_service.console.server import Console, application
     except ImportError as error:
-        raise UsageError(f"{EXTRA} ({error})") from None
+        raise UsageError(f"the console needs a web server: {install_hint('console')} ({error})") from None
     host, port = options.listen
     token = _token(options.token)
     doors = Doors(token, not is_loopback(host), frozenset(options.names), _tiles(options.tiles))

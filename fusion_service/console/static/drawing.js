@@ -104,7 +104,9 @@ function* names(context, state, view, { rows, px, py }) {
     const [x, y] = [px[row], py[row]];
     if (written >= MOST_NAMES) return;
     if (x < 0 || y < 0 || x > view.width || y > view.height) continue;
-    const name = clean(state.tracks.textOf(row)?.name ?? "").slice(0, 18);
+    const said = state.tracks.textOf(row);
+    if (!said || said.id === state.chosen) continue;
+    const name = clean(said.name).slice(0, 18);
     const [row0, from, to] = [Math.round(y / 14), Math.floor(x / 24), Math.floor((x + 12 + 6.5 * name.length) / 24)];
     let free = true;
     for (let k = from; k <= to && free; k += 1) free = !taken.has(`${row0} ${k}`) && !taken.has(`${row0 - 1} ${k}`);

@@ -2,8 +2,11 @@
 
 import { byId, clock, figure, make, pool, say, span } from "/static/dom.js";
 
-const STATES = { there: "there", silent: "silent: its newest tracks are stale", gone: "gone: its token is no more", muted: "muted by order" };
 const KEPT = 300;
+// Seconds; what is later is of a mission with a clock of its own.
+const SAME_CLOCK = 3600;
+
+const short = (s) => (Math.abs(s) < 1 ? `${Math.round(1000 * s)} ms` : span(s));
 
 export class Sources {
   constructor(state, order) {
@@ -18,7 +21,7 @@ export class Sources {
     const order = make("button", { type: "button", class: "order", text: "Order…" });
     order.addEventListener("click", () => this.order(order.dataset.source));
     const head = make("div", { class: "head" }, make("span", { class: "dot" }), make("strong"), make("span", { class: "state" }), order);
-    return make("li", {}, head, make("p", { class: "numbers" }), make("ul", { class: "wrong" }), make("p", { class: "refusal" }));
+    return make("li", {}, head, make("p", { class: "numbers" }), make("ul", { class: "wrong" }), make("ul", { class: "more" }), make("p", { class: "refusal" }));
   }
 
   show(health) {
@@ -27,20 +30,22 @@ export class Sources {
     say(this.count, `${there} of ${sources.length + health.beyond} sources are there${health.beyond ? `; ${health.beyond} more are not listed` : ""}`);
     pool(this.rows, sources.length, () => this.item()).forEach((item, k) => {
       const one = sources[k];
-      const [head, numbers, wrong, refusal] = item.children;
+      const [head, numbers, wrong, more, refusal] = item.children;
       const [dot, name, state, order] = head.children;
       dot.style.backgroundColor = one.colour;
       say(name, one.name);
       item.className = one.state === "there" && !one.wrong.length ? "well" : "unwell";
       const trust = one.trust && one.trust !== "trusted" ? `, ${one.trust}` : "";
-      say(state, `${STATES[one.state] ?? one.state}${trust}`);
+      say(state, `${one.state}${trust}`);
+      if (state.title !== one.means) state.title = one.means;
       order.hidden = !this.state.mayOrder;
       order.dataset.source = one.name;
       order.setAttribute("aria-label", `Order about ${one.name}`);
       say(numbers, this.numbers(one));
       pool(wrong, one.wrong.length, () => make("li")).forEach((line, n) => say(line, one.wrong[n]));
+      pool(more, one.more.length, () => make("li")).forEach((line, n) => say(line, one.more[n]));
       const last = one.refusal;
-      refusal.hidden = !last;
+      refusal.hidden = !last || one.wrong.some((fault) => fault.includes(last.said));
       if (last) say(refusal, `Last refusal${Number.isFinite(last.time) ? ` ${clock(last.time)}` : ""} (${last.reason}, ${figure(last.count)} in all): ${last.said}`);
     });
   }
@@ -48,10 +53,11 @@ export class Sources {
   numbers(one) {
     const parts = [
       one.tracks !== null && `${one.tracks} tracks`,
-      one.linked_share !== null && `${Math.round(100 * one.linked_share)} % shared`,
-      one.rate !== null && `${figure(one.rate)} /s${one.declared_period ? ` of ${figure(1 / one.declared_period)} declared` : ""}`,
-      one.latency !== null && `latency ${span(one.latency)}`,
-      one.clock !== null && Math.abs(one.clock) > 0.0005 && `clock ${one.clock > 0 ? "+" : "−"}${span(Math.abs(one.clock))}`,
+      one.share !== null && `${Math.round(100 * one.share)} % shared`,
+      one.rate !== null && `${figure(one.rate)} a second${one.period ? `, one every ${figure(one.period)} s declared` : ""}`,
+      one.latency !== null && Math.abs(one.latency) < SAME_CLOCK && `latency ${short(one.latency)}`,
+      one.clock !== null && `clock ${one.clock < 0 ? "−" : "+"}${short(Math.abs(one.clock))}`,
+      one.refused ? `${one.refused} refused` : false,
       one.gaps ? `${one.gaps} lost` : false,
     ];
     return parts.filter(Boolean).join(" · ");
