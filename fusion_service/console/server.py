@@ -121,11 +121,11 @@ class Console:
             return
         self.pages += 1
         try:
-            known = await self._opened(socket)
+            known, first = await self._opened(socket)
             if known is None:
                 await socket.close(REFUSED, "the token is missing or wrong")
                 return
-            await _Stream(socket, self, known).run()
+            await _Stream(socket, self, known, first).run()
         except (WebSocketDisconnect, TimeoutError, OSError, RuntimeError):
             pass
         finally:
@@ -133,26 +133,27 @@ class Console:
             with suppress(Exception):
                 await socket.close()
 
-    async def _opened(self, socket: WebSocket) -> bool | None:
-        """Whether the page has the token, by its header or first words; None where it is not let in."""
+    async def _opened(self, socket: WebSocket) -> tuple[bool | None, dict[str, Any]]:
+        """Whether the page has the token, by its header or first words, None where it is not let in; and these words."""
         if self.doors.opens(socket.headers.get("authorization", "").removeprefix("Bearer ")):
-            return True
+            return True, {}
         try:
             first = _words(await asyncio.wait_for(socket.receive_text(), TOKEN_IN))
         except (TimeoutError, KeyError):
             first = {}
         token = first.get("token")
         known = isinstance(token, str) and self.doors.opens(token)
-        return known if known or not (self.doors.locked or token) else None
+        return (known if known or not self.doors.locked else None), first
 
 
 class _Stream:
     """One page's: what it has seen, and what it wants to."""
 
-    def __init__(self, socket: WebSocket, console: Console, known: bool) -> None:
+    def __init__(self, socket: WebSocket, console: Console, known: bool, first: Mapping[str, Any]) -> None:
         self._socket, self._console, self._known = socket, console, known
         self._seen = Seen()
         self._wish = ""
+        self._take(first)
 
     async def run(self) -> None:
         may = self._console.orders and self._known
@@ -166,15 +167,14 @@ class _Stream:
                 await reading
 
     async def _write(self, reading: asyncio.Task[None]) -> None:
-        state, said = self._console.state, -PULSE
+        state, said, shown = self._console.state, -PULSE, ""
         while not reading.done():
             if not self._seen.centre:
                 self._choose(state.names())
-            now = time.monotonic()
-            if now - said >= PULSE:
-                said = now
-                await self._send(text(state.pulse(self._seen.centre)))
-            before = self._seen
+            now, before = time.monotonic(), self._seen
+            if now - said >= PULSE or before.centre != shown:
+                said, shown = now, before.centre
+                await self._send(text(state.pulse(shown)))
             after, news = state.news(before)
             for one in news:
                 await self._send(one)
@@ -196,19 +196,24 @@ class _Stream:
         """What the page says: which centre, and which track."""
         allowance, before = RATE, time.monotonic()
         while True:
-            words = _words(await self._socket.receive_text())
+            words = await self._socket.receive_text()
             now = time.monotonic()
             allowance, before = min(allowance + RATE * (now - before), RATE) - 1.0, now
             if allowance < 0:
                 await self._socket.close(TOO_MUCH, "too much is said")
                 return
-            name, track = words.get("centre"), words.get("track")
-            if isinstance(name, str) and name in self._console.state.names():
-                self._wish, self._seen = name, Seen(name)
-            if "track" in words:
-                number = int(track) if isinstance(track, str) and track.isdecimal() and len(track) <= 20 else None
-                good = number is not None and number < 2**64
-                self._seen = self._seen._replace(track=number if good else None, explained=(-1, -1))
+            self._take(_words(words))
+
+    def _take(self, words: Mapping[str, Any]) -> None:
+        name, track = words.get("centre"), words.get("track")
+        if isinstance(name, str) and name:
+            self._wish = name
+            if name in self._console.state.names():
+                self._seen = Seen(name)
+        if "track" in words:
+            number = int(track) if isinstance(track, str) and track.isdecimal() and len(track) <= 20 else None
+            good = number is not None and number < 2**64
+            self._seen = self._seen._replace(track=number if good else None, explained=(-1, -1))
 
 
 def application(console: Console) -> Guard:

@@ -85,7 +85,7 @@ class State:
                 centre.histories.step(message)
                 centre.steps += 1
             elif isinstance(message, Status):
-                said = health(message, centre.pictures.whole, self._wall(), centre.alarms)
+                said = health(message, centre.pictures.whole, self._wall(), centre.alarms, centre.pictures.label)
                 centre.health, centre.told = text(said), self._clock()
                 centre.checked += 1
 

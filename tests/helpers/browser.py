@@ -11,10 +11,11 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Self
 
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 __all__ = ["CHROMIUM", "Browser", "Page"]
 
@@ -47,7 +48,7 @@ class Browser:
             stdin=subprocess.DEVNULL,
             env=environment,
         )
-        self._pages: list[Page] = []
+        self._sockets = ExitStack()
 
     def __enter__(self) -> Self:
         port = Path(self._folder) / "DevToolsActivePort"
@@ -57,26 +58,25 @@ class Browser:
             assert self._process.poll() is None, "Chromium ended"
             time.sleep(0.02)
         self._base = f"ws://127.0.0.1:{lines[0]}"
-        self._control = Page(f"{self._base}{lines[1]}", enable=False)
+        self._control = Page(self._joined(f"{self._base}{lines[1]}"), enable=False)
         return self
 
-    def page(self, url: str, width: int = 1280, height: int = 800, **media: str) -> Page:
-        """A tab of this size with a memory of its own; media: features of the screen, as in scheme="dark"."""
+    def _joined(self, address: str) -> ClientConnection:
+        return self._sockets.enter_context(connect(address, max_size=2**27, open_timeout=20))
+
+    def page(self, url: str, width: int = 1280, height: int = 800, scheme: str = "light") -> Page:
+        """A tab of this size with a memory of its own, on a system that is light or dark."""
         context = self._control.call("Target.createBrowserContext")["browserContextId"]
         where = {"url": "about:blank", "browserContextId": context}
         target = self._control.call("Target.createTarget", **where)["targetId"]
-        page = Page(f"{self._base}/devtools/page/{target}")
-        self._pages.append(page)
+        page = Page(self._joined(f"{self._base}/devtools/page/{target}"))
         page.size(width, height)
-        if "scheme" in media:
-            feature = {"name": "prefers-color-scheme", "value": media["scheme"]}
-            page.call("Emulation.setEmulatedMedia", features=[feature])
+        page.scheme(scheme)
         page.call("Page.navigate", url=url)
         return page
 
     def __exit__(self, *_: object) -> None:
-        for page in (*self._pages, self._control):
-            page.close()
+        self._sockets.close()
         self._process.terminate()
         try:
             self._process.wait(10)
@@ -89,16 +89,13 @@ class Browser:
 class Page:
     """A tab. complaints: what the page has said on its console of errors, exceptions and refused contents."""
 
-    def __init__(self, address: str, enable: bool = True) -> None:
-        self._socket = connect(address, max_size=2**27, open_timeout=20)
+    def __init__(self, socket: ClientConnection, enable: bool = True) -> None:
+        self._socket = socket
         self._number = 0
         self.complaints: deque[str] = deque(maxlen=100)
         if enable:
             for domain in ("Page", "Runtime", "Log"):
                 self.call(f"{domain}.enable")
-
-    def close(self) -> None:
-        self._socket.close()
 
     def call(self, method: str, **parameters: Any) -> dict[str, Any]:
         """A command of the protocol, and its result."""
@@ -126,6 +123,10 @@ class Page:
         self.call(
             "Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=scale, mobile=False
         )
+
+    def scheme(self, scheme: str) -> None:
+        """Whether the system is light or dark."""
+        self.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
 
     def js(self, expression: str) -> Any:
         """The value of an expression in the page, promises awaited."""

@@ -97,13 +97,10 @@ function showFigures() {
 const takes = {
   hello(message) {
     Object.assign(state, { mayOrder: message.may_order, offers: message.orders, who: message.who });
-    byId("tab-orders").hidden = !message.may_order;
     chart.tiles = message.tiles;
     say(byId("owed"), message.tiles ? message.attribution || "map: as configured" : "");
     document.title = `Fusion console · ${clean(message.realm)}`;
-    if (state.centre) state.stream.say({ centre: state.centre });
-    if (state.chosen !== null) state.stream.say({ track: state.chosen });
-    if (message.orders && !message.may_order) say(byId("spoken"), "Orders are off here: open the address that the console printed");
+    orders.offer(message);
     track.show();
   },
   pulse(message) {
@@ -126,7 +123,7 @@ const takes = {
     chart.make(state.tracks.geo);
     if (state.pulse) Object.assign(state.pulse, { age: 0 });
     state.heard = performance.now();
-    if (!chart.touched && (fresh || state.tracks.count !== chart.fitted)) {
+    if (!chart.touched && state.chosen === null && (fresh || state.tracks.count !== chart.fitted)) {
       chart.fitted = state.tracks.count;
       chart.fit();
     }
@@ -190,7 +187,7 @@ byId("centre").addEventListener("change", ({ target }) => state.stream.say({ cen
 takeOptions();
 takeKeys({ act, order: () => orders.open(), shown: (name) => (name === "orders" ? orders.list() : name === "tracks" && list.show()) });
 followTheme(() => chart.redraw());
-state.stream = new Stream((message) => takes[message.type]?.(message), (open, why) => {
+state.stream = new Stream(() => ({ centre: state.centre, track: state.chosen }), (message) => takes[message.type]?.(message), (open, why) => {
   if (open) log.clear();
   Object.assign(state, { open, why });
   showCondition();

@@ -12,10 +12,19 @@ export class Orders {
     this.dialog = byId("order-dialog");
     this.rows = make("ul", { class: "rows orders" });
     this.count = make("p", { class: "count", text: "" });
-    const look = make("button", { type: "button", text: "Look again" });
-    look.addEventListener("click", () => this.list());
-    byId("orders").append(make("div", { class: "buttons" }, look), this.count, this.rows);
+    this.look = make("button", { type: "button", text: "Look again" });
+    this.look.addEventListener("click", () => this.list());
+    byId("orders").append(make("div", { class: "buttons" }, this.look), this.count, this.rows);
     this.build();
+  }
+
+  /** Whether orders can be given, and why not. */
+  offer({ orders, may_order: may }) {
+    byId("tab-orders").hidden = !orders;
+    this.look.hidden = !may;
+    const why = "Orders need the token of this console: open the address that it printed when it was started.";
+    say(this.count, may ? "" : why);
+    if (!may) this.rows.replaceChildren();
   }
 
   build() {

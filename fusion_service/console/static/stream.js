@@ -31,8 +31,10 @@ export function token() {
 }
 
 export class Stream {
-  /** take(message): of every message; link(open, why): when the connection opens or closes. */
-  constructor(take, link) {
+  /** first(): what is said with the token; take(message): of every message; link(open, why): when the connection opens
+   *  or closes. */
+  constructor(first, take, link) {
+    this.first = first;
     this.take = take;
     this.link = link;
     this.token = token();
@@ -40,13 +42,18 @@ export class Stream {
     this.wait = FIRST;
     this.socket = null;
     this.open();
+    addEventListener("hashchange", () => {
+      this.token = token();
+      this.wait = FIRST;
+      this.socket?.close();
+    });
   }
 
   open() {
     const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/stream`);
     socket.binaryType = "arraybuffer";
     this.socket = socket;
-    socket.onopen = () => socket.send(JSON.stringify({ token: this.token }));
+    socket.onopen = () => socket.send(JSON.stringify({ token: this.token, ...this.first() }));
     socket.onmessage = ({ data }) => {
       this.bytes += data.byteLength ?? data.length;
       const message = typeof data === "string" ? JSON.parse(data) : unpacked(data);
