@@ -134,7 +134,7 @@ class Console:
                 await socket.close()
 
     async def _opened(self, socket: WebSocket) -> tuple[bool | None, dict[str, Any]]:
-        """Whether the page has the token, by its header or first words, None where it is not let in; and these words."""
+        """Whether the page has the token, by its header or first words, None: it is not let in; and these words."""
         if self.doors.opens(socket.headers.get("authorization", "").removeprefix("Bearer ")):
             return True, {}
         try:

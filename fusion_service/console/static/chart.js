@@ -49,7 +49,7 @@ export class Chart {
     const pane = map.getPane("overlayPane");
     this.layers = ["base", "picture", "mark"].map((name) => new Layer(pane, this.draw[name]));
     map.on("moveend resize", () => this.redraw());
-    map.on("move", () => this.layers.forEach((one) => one.ask(map)));
+    map.on("move", () => this.layers.forEach((one) => one.leaves(map) && one.ask(map)));
     map.on("zoom viewreset", () => {
       this.layers.forEach((one) => one.stretch(map));
       this.redraw();

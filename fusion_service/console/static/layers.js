@@ -36,6 +36,14 @@ export class Layer {
     return node;
   }
 
+  /** Whether the map has been moved so far that the rim of what is drawn comes into sight. */
+  leaves(map) {
+    if (!this.view) return true;
+    const { left, top, pad } = this.view;
+    const { x, y } = map.getPixelBounds().min;
+    return Math.abs(x - left - pad[0]) > 0.6 * pad[0] || Math.abs(y - top - pad[1]) > 0.6 * pad[1];
+  }
+
   /** Draw anew; what is being drawn is finished first, unless `now`. */
   ask(map, now = false) {
     this.map = map;
