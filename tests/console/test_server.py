@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import re
 import socket
 import threading
 import time
@@ -360,3 +362,17 @@ def test_places_of_tiles_and_hosts() -> None:
     assert [is_loopback(one) for one in ("127.0.0.1", "::1", "localhost", "0.0.0.0", "192.0.2.1", "h")] == [
         True
     ] * 3 + [False] * 3
+
+
+def test_the_map_library_is_the_one_that_is_named() -> None:
+    folder = server_module.STATIC / "leaflet"
+    told = dict(re.findall(r"^(\S+) +sha256 (\w{64})$", (folder / "VERSION.txt").read_text("utf-8"), re.M))
+    found = {name: hashlib.sha256((folder / name).read_bytes()).hexdigest() for name in ("leaflet.js", "leaflet.css")}
+    assert found == told
+
+
+def test_files_of_the_page_are_short_and_make_no_markup() -> None:
+    for path in server_module.STATIC.glob("*.*"):
+        text = path.read_text("utf-8")
+        assert len(text.splitlines()) <= 400, path.name
+        assert not re.search(r"innerHTML|outerHTML|insertAdjacentHTML|document\.write|eval\(", text), path.name
