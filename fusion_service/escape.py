@@ -11,7 +11,7 @@ import os
 from contextlib import suppress
 from typing import Any, TextIO
 
-__all__ = ["Escaped", "escaped", "into_nothing"]
+__all__ = ["STEERING", "Escaped", "escaped", "into_nothing"]
 
 STEERING = {*range(0x20), *range(0x7F, 0xA0), *range(0x2028, 0x202F), *range(0x2066, 0x206A)} - {0x09, 0x0A}
 TABLE = {code: f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" for code in STEERING}

@@ -37,6 +37,8 @@ __all__ = [
 ]
 
 T = TypeVar("T")
+LEFT_OVER = "unrecognized arguments: "
+"""With which argparse tells of options that no command took."""
 
 GRACE = 4.0
 """Seconds after the first signal in which a process must have ended by itself."""
@@ -147,16 +149,13 @@ class Parser(argparse.ArgumentParser):
         self._given = sys.argv[1:] if args is None else list(args)
         return super().parse_known_args(args, namespace)
 
-    def parse_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As in argparse; what is left over is told of by the command that it was given to."""
-        found, left = self.parse_known_args(args, namespace)
-        if left:
-            command = next((one for word in self._given if (one := self._commands().get(word))), self)
-            command.error(f"unrecognized arguments: {' '.join(left)}{command._meant(left[0])}")
-        return found
-
     def error(self, message: str) -> NoReturn:
-        """End with the usage and `message`; exit code 2."""
+        """End with the usage and `message`, of the command that it is about; exit code 2."""
+        if message.startswith(LEFT_OVER):
+            command = next((one for word in self._given if (one := self._commands().get(word))), None)
+            if command is not None:
+                command.error(message)
+            message += self._meant(message.removeprefix(LEFT_OVER))
         if found := re.search(r"invalid choice: '([^']{1,64})' \(choose from (.*)\)", message):
             known = [one.strip(" '") for one in found[2].split(",")]
             if near := difflib.get_close_matches(found[1], known, 1):
@@ -182,7 +181,7 @@ class Parser(argparse.ArgumentParser):
         return {name: one for some in found for name, one in some.items()}
 
     def _meant(self, option: str) -> str:
-        near = difflib.get_close_matches(option.partition("=")[0], self._option_string_actions, 1)
+        near = difflib.get_close_matches(re.split("[ =]", option)[0], self._option_string_actions, 1)
         return f" (did you mean {near[0]}?)" if option.startswith("-") and near else ""
 
 

@@ -34,6 +34,7 @@ SECTIONS = {
             "operating",
             "console",
             "troubles",
+            "top",
             "standby",
             "security",
             "arrival",

@@ -16,12 +16,13 @@ from pathlib import Path
 
 from fusion_service.bus.roles import ROLES, Party, common_name
 from fusion_service.bus.security import FILE, HUB, SecurityError, read_security
+from fusion_service.extras import install_hint
 from schemas import REALM
 
 try:
     from fusion_service.bus import certificates
 except ImportError as error:
-    raise ImportError(f"making keys needs a package more: pip install cryptography ({error})") from None
+    raise ImportError(f"making keys needs a package more: {install_hint('keys')} ({error})") from None
 
 __all__ = ["Keyring"]
 

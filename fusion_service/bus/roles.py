@@ -92,7 +92,7 @@ def rights(party: Party) -> Rights:
             ask=(picture, f"global/{name}/state"),
             asked=(picture,),
         ),
-        "recorder": Rights(own=(f"record/{name}/**",), read=("**",)),
+        "recorder": Rights(own=(f"record/{name}/**",), read=("**",), asked=asks[1:]),
         "viewer": Rights(read=looks, ask=asks),
         "operator": Rights(read=looks, ask=(*asks, f"global/*/orders/{name}")),
         "gateway": Rights(own=(f"local/{name}/**",), read=looks, ask=asks),

@@ -160,6 +160,8 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
 def _check_place(path: Path, *, folder: bool, make: bool) -> None:
     """Before a hub is waited for: that Rerun is there, and that `path`, a file or a `folder` of parts, can be written.
     make: the folder that it is in, if need be. Raises ImportError, OSError."""
+    import tempfile
+
     from fusion_service.recording.columns import import_rerun
 
     if path.exists() and (not folder or path.is_file()):
@@ -169,6 +171,10 @@ def _check_place(path: Path, *, folder: bool, make: bool) -> None:
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path.parent} is no folder that exists: make it, or name another place with --out")
     place = path if path.is_dir() else path.parent
-    if not os.access(place, os.W_OK | os.X_OK):
-        raise PermissionError(f"{place} cannot be written: name another place with --out, or mend its owner and mode")
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        why = os.strerror(error.errno or 0)
+        raise PermissionError(f"{place} cannot be written ({why}): name another place with --out, or mend it") from None
     import_rerun()

@@ -106,8 +106,9 @@ def _ask(ear: Ear, bus: Bus, stop: threading.Event) -> None:
 
 
 def _live(look: Callable[[], View], order: str, stop: threading.Event) -> None:
-    """By rich, or in lines where that is not there."""
+    """By rich, or in lines where that is not there, or the terminal can do no more."""
     import importlib.util
+    import os
     import shutil
     import sys
 
@@ -115,10 +116,12 @@ def _live(look: Callable[[], View], order: str, stop: threading.Event) -> None:
     from fusion_service.lookout.layout import Look, frame, plain
     from fusion_service.lookout.screen import show
 
-    if importlib.util.find_spec("rich") is not None:
+    simple = os.environ.get("TERM", "dumb") in ("", "dumb", "unknown")
+    if importlib.util.find_spec("rich") is None:
+        print(f"the live view needs the package rich: {install_hint('top')}", file=sys.stderr)
+    elif not simple:
         show(look, Look(order), stop)
         return
-    print(f"the live view needs the package rich: {install_hint('top')}", file=sys.stderr)
     while not stop.wait(LINES):
         for line in frame(look(), Look(order), shutil.get_terminal_size().columns):
             print(plain(line))

@@ -105,7 +105,7 @@ def _compiled(wanted: bool, stop: threading.Event | None) -> tuple[str, SimpleNa
         import numba
     except ImportError as error:
         if wanted:
-            raise ValueError(f"numba cannot be used ({error}): pip install 'track-fusion-centre[fast]'") from None
+            raise ValueError(f"numba cannot be used ({error}): pip install numba") from None
         return PLAIN, None
     for name in SHAPES:
         if stop is not None and stop.is_set():

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from fusion_service.errors import DataError, UsageError
@@ -12,6 +14,8 @@ from fusion_service.process import data_folder
 
 __all__ = ["AUTOFERRY", "MRCLAM", "THREE_RADARS", "MissionPlan", "plan_mission", "with_faults"]
 
+RANGING = (1, 2)
+"""Lidar and radar in the Autoferry files."""
 JITTER = 1.5
 """Seconds that the machine may hold a client up, and it is still waited for."""
 
@@ -96,7 +100,17 @@ def plan_mission(
             scenario, {name: [*command, name] for name in (*robots, "truth")}, MRCLAM, 756.0, 5.0, 1.0, 1.0, 3.0
         )
     clients = {name: [*command, name] for name in ("lidar", "radar", *(("ir", "eo") if cameras else ()), "truth")}
-    return MissionPlan(scenario, clients, AUTOFERRY, 140.0, 10.0, 20.0, 1.0, 3.0)
+    return MissionPlan(scenario, clients, AUTOFERRY, _seconds(folder / first), 10.0, 20.0, 1.0, 3.0)
+
+
+def _seconds(path: Path) -> float:
+    """From the first scan of a lidar or radar in a file of detections to the last. Raises `DataError`."""
+    try:
+        records = json.loads(path.read_bytes())
+        times = [float(one["time"]) for one in records if one["sensorID"] in RANGING]
+        return max(times) - min(times)
+    except (ValueError, TypeError, KeyError) as error:
+        raise DataError(f"{path} is no file of detections: {type(error).__name__}: {error}") from None
 
 
 def with_faults(plan: MissionPlan, faults: Sequence[str]) -> MissionPlan:

@@ -89,7 +89,12 @@ def run_demo(
     endpoint = free_endpoint()
     config = write_config(folder, settings, endpoint)
     load_config(config)
-    print(f"{scenario}: {plan.seconds:g} s of mission at {speed:g} times real time, into {folder}", flush=True)
+    takes = plan.seconds / speed + START
+    print(
+        f"{scenario}: {plan.seconds:.0f} s of mission at {speed:g} times real time, which takes {takes:.0f} s, and a "
+        f"few to begin and end; into {folder}",
+        flush=True,
+    )
     _fly(plan, folder, config, recording, endpoint, speed, stop)
     if stop.is_set():
         print(f"stopped; the recording so far: {recording}")

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
-__all__ = ["Keys", "keyboard"]
+__all__ = ["Keys", "keyboard", "split_keys"]
 
 NAMES = {
     "\x1b[A": "up", "\x1bOA": "up", "k": "up", "\x1b[B": "down", "\x1bOB": "down", "j": "down",
@@ -33,7 +33,7 @@ class Keys:
         text = self._text(wait)
         if text.endswith("\x1b"):
             text += self._text(LATER)
-        return list(_split(text))
+        return list(split_keys(text))
 
     def _text(self, wait: float) -> str:
         if self._descriptor is None or self.closed:
@@ -49,7 +49,7 @@ class Keys:
         return data.decode(errors="replace")
 
 
-def _split(text: str) -> Iterator[str]:
+def split_keys(text: str) -> Iterator[str]:
     """The keys in what was read."""
     while text:
         longest = next((size for size in (4, 3) if text[:size] in NAMES), 1)
@@ -65,7 +65,7 @@ def keyboard() -> Iterator[Keys]:
     try:
         descriptor = sys.stdin.fileno()
         before = termios.tcgetattr(descriptor)
-    except (OSError, ValueError, termios.error):  # no terminal
+    except (AttributeError, OSError, ValueError, termios.error):  # no terminal
         yield Keys(None)
         return
     changed = termios.tcgetattr(descriptor)

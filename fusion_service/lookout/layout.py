@@ -93,11 +93,13 @@ ORDERS: dict[str, Callable[[Row], Any]] = {
 
 class Look(NamedTuple):
     """How one looks at a view. order: of `ORDERS`; chosen: (centre, source) that is marked; alone: whether it is shown
-    by itself; paused; said: a line for the foot; live: whether keys do something, and the height counts."""
+    by itself, from the line `scroll` on; paused; said: a line for the foot; live: whether keys do something, and the
+    height counts."""
 
     order: str = "trouble"
     chosen: tuple[str, str] | None = None
     alone: bool = False
+    scroll: int = 0
     paused: bool = False
     said: str = ""
     live: bool = False
@@ -122,10 +124,18 @@ def frame(view: View, look: Look, width: int, height: int = 0) -> list[Line]:
     if height:
         head = head[: max(1, height // 2)]
         room = max(height - len(head) - len(foot), 1)
-        first = max(0, min(marked - room // 2, len(body) - room))
+        first = max(0, min(look.scroll or marked - room // 2, len(body) - room))
         lines = [*head, *body[first : first + room]]
         lines = [*lines, *[[]] * (height - len(lines) - len(foot)), *foot][:height]
-    return [[(_clean(text), style) for text, style in line] for line in lines]
+    return [_cropped([(_clean(text), style) for text, style in line], width) for line in lines]
+
+
+def _cropped(line: Line, width: int) -> Line:
+    found: Line = []
+    for text, style in line:
+        found.append((text[:width], style))
+        width -= len(found[-1][0])
+    return found
 
 
 def plain(line: Line) -> str:
@@ -275,7 +285,7 @@ def _source(view: View, centre: str, row: Row, width: int) -> list[Line]:
     said = next(one.health.data["sources"][row.name] for one in view.centres if one.name == centre)
     lines: list[Line] = [
         [],
-        [(f"  {row.name}", "mark"), (f" of centre {centre}: {row.state}: {STATES[row.state]}", "head")],
+        *_wrapped("  ", f"{row.name} of centre {centre}: {row.state}: {STATES[row.state]}", width, "head", 0),
     ]
     for fault in row.faults:
         lines += _wrapped("! ", fault, width, "wrong", 0)
@@ -302,6 +312,8 @@ def _value(value: Any) -> str:
 def _foot(view: View, look: Look, width: int) -> list[Line]:
     if not look.live:
         return []
-    keys = "q quit  Esc back" if look.alone else f"q quit  s sort ({look.order})  p pause  ↑↓ choose  Enter one source"
+    keys = (
+        "q quit  ↑↓ scroll  Esc back" if look.alone else f"q quit  s sort ({look.order})  p pause  ↑↓ Enter one source"
+    )
     lines: list[Line] = [[(keys[:width], "quiet")]]
     return [*_wrapped("  ", look.said, width, "doubt", 1), *lines] if look.said else lines

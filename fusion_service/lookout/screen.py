@@ -17,14 +17,15 @@ from fusion_service.lookout.view import View
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-__all__ = ["show"]
+__all__ = ["pressed", "show"]
 
 PERIOD = 1.0
 """Seconds between two views."""
 QUICK = 0.1
 """Seconds in which a key is answered."""
 STYLES = {"wrong": "bold red", "doubt": "yellow", "well": "green", "quiet": "dim", "head": "bold", "mark": "reverse"}
-PAGE = 10
+PAGE, FARTHEST = 10, 200
+"""Lines of a page, and as many as are scrolled at most."""
 
 
 class _Last(logging.Handler):
@@ -100,13 +101,15 @@ def pressed(key: str, look: Look, view: View) -> Look:
         names = list(ORDERS)
         return look._replace(order=names[(names.index(look.order) + 1) % len(names)])
     if key == "back":
-        return look._replace(alone=False) if look.alone else look._replace(chosen=None)
+        return look._replace(alone=False, scroll=0) if look.alone else look._replace(chosen=None)
     moved = {"up": -1, "down": 1, "page up": -PAGE, "page down": PAGE}
+    if key in moved and look.alone:
+        return look._replace(scroll=max(0, min(look.scroll + moved[key], FARTHEST)))
     if key in moved and rows:
         first = 0 if moved[key] > 0 else len(rows) - 1
         return look._replace(chosen=rows[first if at < 0 else max(0, min(at + moved[key], len(rows) - 1))])
     if key == "enter" and rows:
-        return look._replace(alone=True, chosen=rows[max(at, 0)])
+        return look._replace(alone=True, scroll=0, chosen=rows[max(at, 0)])
     return look
 
 

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats
+from fusion_service.extras import install_hint
 
 __all__ = [
     "ColumnWriter",
@@ -48,7 +49,7 @@ def import_rerun() -> Any:
     try:
         import rerun
     except ImportError as error:
-        raise ImportError(f"recording needs rerun-sdk ({error}): pip install 'track-fusion-centre[record]'") from error
+        raise ImportError(f"recording needs rerun-sdk ({error}): {install_hint('record')}") from error
     return rerun
 
 

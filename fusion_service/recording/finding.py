@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import Any
 
+from fusion_service.extras import install_hint
+
 __all__ = ["Finding", "Gathered", "at", "span"]
 
 MOST = 20
@@ -104,7 +106,7 @@ class Gathered:
         if not doubts and self.unsigned and (asked or self.signers):
             doubts = "not all of it is signed" if self.signers else "not signed by anybody of the authority given"
         if self.unchecked:
-            doubts = "signatures cannot be checked: pip install cryptography"
+            doubts = f"signatures cannot be checked: {install_hint('keys')}"
         if len(self.keys) > 1:
             self.note(f"by {len(self.keys)} different keys")
         if not asked and self.signers:

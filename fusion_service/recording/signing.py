@@ -17,6 +17,7 @@ from fusion_service.bus.roles import ROLES
 from fusion_service.bus.security import HUB, check_private
 from fusion_service.errors import UsageError
 from fusion_service.escape import escaped
+from fusion_service.extras import install_hint
 from fusion_service.recording.chain import signed_bytes
 
 __all__ = ["Authority", "Identity", "Signer", "fingerprint", "import_cryptography", "load_signer", "read_authority"]
@@ -31,7 +32,7 @@ def import_cryptography() -> None:
     try:
         import cryptography  # noqa: F401
     except ImportError as error:
-        raise ImportError(f"signatures need a package more: pip install cryptography ({error})") from None
+        raise ImportError(f"signatures need a package more: {install_hint('keys')} ({error})") from None
 
 
 def fingerprint(identity: str) -> str:

@@ -19,6 +19,7 @@ import numpy as np
 from fusion_service.arrays import Floats
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
+from fusion_service.extras import install_hint
 from fusion_service.geodesy import ecef_to_geodetic, enu_to_geodetic
 from fusion_service.recording import read
 from schemas import (
@@ -200,7 +201,7 @@ def _parquet(path: Path, names: tuple[str, ...]) -> Iterator[Write]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        raise ReviewError(f"Parquet needs pyarrow ({error}): pip install 'track-fusion-centre[record]'") from None
+        raise ReviewError(f"Parquet needs pyarrow ({error}): {install_hint('record')}") from None
 
     def kind(name: str) -> Any:
         if name in INTEGERS:

@@ -169,7 +169,7 @@ class Service:
         """Take what has come, make a step if one is due, and say how it goes. At most one step between two readings of
         the inbox."""
         self._heart.turned()
-        due = min(self._status_due - time.monotonic(), self._wait(), self._tenure.pace)
+        due = min(self._status_due - time.monotonic(), self._times.wait(time.time_ns()), self._tenure.pace)
         wait = 0.0 if self._stepped else max(0.0, due)
         for item in self._take(wait):
             if stop.is_set():
@@ -183,16 +183,13 @@ class Service:
             self._status_due = time.monotonic() + self._config.service.status_period
             notify(f"WATCHDOG=1\nSTATUS={status_line(self._publish_status())}")
 
-    def _wait(self) -> float:
-        return self._times.wait(time.time_ns())
-
     def _declare(self) -> None:
         realm, name, bus = self._config.bus.realm, self._config.centre.name, self._bus
         self._out = {
             what: bus.publisher(global_key(name, what, realm), cache=KEPT if what != "status" else 1)
             for what in ("tracks", "log", "status")
         }
-        bus.watch(local_key("*", "alive", realm), self._tokens.note)
+        self._tokens.watch(bus, realm)
         for what in ("info", "tracks", "intensity"):
             bus.subscribe(local_key("*", what, realm), self._on_sample, on_miss=self._on_miss)
         for centre in filter(None, map(is_picture_of, self._config.centre.sources)):
@@ -361,6 +358,7 @@ class Service:
 
     def _publish_status(self) -> Status:
         last = self._result.status if self._result is not None else None
+        self._tokens.compare(last.sources if last is not None else {})
         self._refused = self._lasting.centre.refusals()
         self._told.refusals(self._refused, last.dropped if last is not None else {})
         self._complaints.think(self._tokens.told, self._result.picture.frame if self._result is not None else None)
@@ -382,7 +380,7 @@ class Service:
                 skipped=self._times.skipped,
                 overload=None if since is None else time.monotonic() - since,
                 busy=busy,
-                more=(*self._tenure.notes(), *filter(None, [self._lasting.alarm])),
+                more=(*self._tenure.notes(), *filter(None, [self._lasting.alarm]), *self._tokens.beside()),
             )
             status = self._complaints.told_in(self._flow.told_in(status))
             status = replace(status, term=self._tenure.term, standby=self._tenure.numbers())

@@ -59,14 +59,17 @@ def _given(view: View) -> dict[str, int]:
 
 
 def _tracks(view: View) -> str:
-    """The tracks that there are, as they are shown: by their short number where that is one track's alone."""
-    called = {track: name for name, track in reversed(_given(view).items())}
+    """The tracks that there are, as they are shown: by the number that an order gave, or their short one where that is
+    one track's alone, and their callsign."""
+    renamed = {one.order.track: one.order for one in view.standing.values() if one.order.what == "rename"}
     ids = view.ids.tolist()
     often = Counter(one % COUNTERS for one in ids)
     told = []
     for one in ids[:LISTED]:
-        short = str(one % COUNTERS if often[one % COUNTERS] == 1 else one)
-        told.append(f"{short} ({called[one]})" if one in called else short)
+        order = renamed.get(one)
+        short = one % COUNTERS if often[one % COUNTERS] == 1 else one
+        number = str((order.shown if order is not None else 0) or short)
+        told.append(f"{number} ({order.name})" if order is not None and order.name else number)
     return (", ".join(told) or "none") + (" ..." if len(ids) > LISTED else "")
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.errors import DataError
+from fusion_service.extras import install_hint
 from schemas import check_name, unpack_lower
 from schemas.flat import frame_of, lower, space_of
 from sensor_clients.events import Event, Scenario
@@ -182,7 +183,7 @@ def _parquet(path: Path) -> dict[str, list[Any]]:
         import pyarrow as pa
         from pyarrow import parquet
     except ImportError as error:
-        raise ImportError(f"Parquet needs pyarrow ({error}): pip install 'track-fusion-centre[record]'") from None
+        raise ImportError(f"Parquet needs pyarrow ({error}): {install_hint('record')}") from None
     if not path.is_file():
         raise FileNotFoundError(f"no file {path}")
     try:

@@ -46,6 +46,21 @@ def viewer(lab: Lab) -> bool:
         return whole and lab.wait(lambda: bool(heard), 3.0)
 
 
+def recorder_seen(lab: Lab) -> bool:
+    """A viewer sees that a recorder is there, and asks what it keeps."""
+    tokens: list[str] = []
+    with (
+        open_bus([lab.endpoint], wait=10.0, security=lab.security("recorder-rec")) as recorder,
+        open_bus([lab.endpoint], wait=10.0, security=lab.security("viewer-wall")) as bus,
+    ):
+        recorder.announce(f"{V1}/record/rec/alive")
+        recorder.answer(f"{V1}/record/rec/state", lambda _: b"kept")
+        bus.watch(f"{V1}/record/*/alive", lambda key, up: tokens.append(key))
+        return lab.wait(
+            lambda: bool(tokens) and [(f"{V1}/record/rec/state", b"kept")] == bus.ask(f"{V1}/record/*/state"), 3.0
+        )
+
+
 def operator(lab: Lab) -> bool:
     """An operator's order, by the command, is obeyed, and stands in the operator's name; `list` tells it."""
     security = [] if lab.keys is None else ["--security", str(lab.keys / "operator-alice")]
@@ -101,6 +116,7 @@ USES: dict[str, Callable[[Lab], bool]] = {
     "a source is fused": source,
     "a late recorder gets what is cached": late_recorder,
     "a viewer reads the picture": viewer,
+    "a viewer sees the recorder": recorder_seen,
     "an operator's order": operator,
     "a gateway publishes and reads": gateway,
     "the service comes back": service_again,

@@ -317,5 +317,5 @@ def test_an_extra_that_is_missing_is_named(
     monkeypatch.setitem(sys.modules, module, None)
     assert main(["evaluate", str(flown), "--html", str(tmp_path / "page.html")]) == 1
     error = capsys.readouterr().err
-    assert f"track-fusion-centre[{extra}]" in error
+    assert f"[{extra}]'" in error
     assert error.count("\n") == 1

@@ -1,8 +1,9 @@
-"""`status` and `listen` beside a real service: what they print, and what they end with."""
+"""`status`, `top` and `listen` beside a real service: what they show, and what they end with."""
 
 from __future__ import annotations
 
 import json
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -16,20 +17,31 @@ import schemas
 from fusion_service import __version__
 from fusion_service.cli import main
 from tests.helpers.processes import Hub, eventually, free_endpoint
-from tests.helpers.scene import Scene, opened
+from tests.helpers.scene import COMMAND, Scene, opened
+from tests.helpers.terminal import Terminal
 
 
 @pytest.fixture(scope="module")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
-    """A service with two sensors that see the same."""
+def its_hub() -> Iterator[Hub]:
+    hub = Hub().start()
+    yield hub
+    hub.kill()
+
+
+@pytest.fixture(scope="module")
+def scene(its_hub: Hub, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    """A service with two sensors that see the same, and a recorder."""
     with ExitStack() as stack:
-        hub = Hub().start()
-        stack.callback(hub.kill)
-        made = stack.enter_context(opened(hub, tmp_path_factory.mktemp("status")))
+        made = stack.enter_context(opened(its_hub, tmp_path_factory.mktemp("status")))
         made.service()
+        out = str(made.folder / "mission.rrd")
+        made.start(COMMAND, "record", "--connect", made.endpoint, "--out", out, "--name", "rec", "--no-draw")
         made.sensor("r1", 0, 1)
         made.sensor("r2", 0, 1)
         eventually(lambda: made.seen.sees(0, 1)() and made.said_of("r2", "rate"), 30)
+        tokens: dict[str, bool] = {}
+        made.bus.watch(schemas.record_key("*", "alive"), tokens.__setitem__)
+        eventually(lambda: tokens.get("fusion/v1/record/rec/alive"), 30)
         yield made
 
 
@@ -49,6 +61,17 @@ def test_a_centre_that_is_well_is_told_and_ends_with_0(scene: Scene, capsys: pyt
     text = capsys.readouterr().out
     assert "centre centre: up" in text
     assert "100% shared with others" in text
+    assert f"recorder rec: {scene.folder / 'mission.rrd'} on " in text
+
+
+def test_the_recorder_says_what_it_keeps(scene: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["status", "--connect", scene.endpoint, "--json"]) == 0
+    (recorder,) = json.loads(capsys.readouterr().out)["recorders"]
+    assert (recorder["name"], recorder["wrong"], recorder["parts"], recorder["lost"]) == ("rec", [], 1, 0)
+    assert recorder["file"] == str(scene.folder / "mission.rrd")
+    assert recorder["messages"] > 0
+    assert recorder["bytes"] > 0
+    assert recorder["silent"] < 15.0
 
 
 def test_what_is_wrong_is_told_and_ends_with_1(scene: Scene, capsys: pytest.CaptureFixture[str]) -> None:
@@ -83,7 +106,10 @@ def test_what_is_wrong_is_told_and_ends_with_1(scene: Scene, capsys: pytest.Capt
     assert told.err.count("\n") == 1
 
 
-def test_nobody_who_answers_ends_with_1(scene: Scene, capsys: pytest.CaptureFixture[str]) -> None:
+def test_nobody_who_answers_ends_with_1(
+    scene: Scene, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("fusion_service.commands.status.PATIENCE", 0.5)
     assert main(["status", "--connect", scene.endpoint, "--realm", "nowhere", "--for", "0.1", "--json"]) == 1
     told = capsys.readouterr()
     assert "no centre of the realm nowhere answers" in json.loads(told.out)["wrong"][0]
@@ -115,6 +141,51 @@ def test_listen_says_what_is_wrong_and_that_nothing_came(scene: Scene, capsys: p
     assert "publish on fusion/v1/local/NAME/tracks" in told
     assert main(["listen", "nothing/here", "--for", "0.3", *where]) == 1
     assert "nothing was heard on nothing/here" in capsys.readouterr().err
+
+
+def test_top_shows_who_is_wrong_lives_through_the_hub_and_ends_by_q(scene: Scene, its_hub: Hub) -> None:
+    late = scene.bus.publisher("fusion/v1/local/m03/tracks", cache=1)
+    stop = threading.Event()
+
+    def publish() -> None:
+        while not stop.wait(0.3):
+            late.put(b'{"source": "m03"}')
+
+    thread = threading.Thread(target=publish)
+    thread.start()
+    try:
+        with Terminal("top", "--connect", scene.endpoint, width=70, height=40, NO_COLOR="1") as top:
+            eventually(lambda: top.shows("! m03", "payload is JSON: send MessagePack", "recorder rec: "), 30)
+            rows = [line for line in top.screen() if line[2:4] in ("m0", "r1", "r2")]
+            assert [line[:5] for line in sorted(rows[:2])] == ["! m01", "! m03"]
+            assert [line[:4] for line in rows[2:]] == ["  r1", "  r2"]
+            assert [line.split()[1] for line in rows[-2:]] == ["there", "there"]
+            assert max(map(len, top.screen())) <= 70
+            top.resize(70, 14)
+            top.press("\x1b[B\r")
+            eventually(lambda: top.shows("m0", " of centre centre: refused", "Esc back"))
+            top.press("\x1b[6~")
+            eventually(lambda: not top.shows(" of centre centre: refused") and top.shows("Esc back"))
+            top.press("\x1bs")
+            eventually(lambda: top.shows("s sort (name)", "SOURCE"))
+            top.resize(120, 30)
+            eventually(lambda: top.shows("LAST REFUSAL", "LATENCY"))
+            its_hub.kill()
+            eventually(lambda: top.shows("! the hub is away: what is shown is as it was", "r1"))
+            its_hub.start()
+            eventually(lambda: top.screen() and not top.shows("the hub is away"), 30)
+            top.press("p")
+            eventually(lambda: top.shows("PAUSED"))
+            assert "\x1b[2J" not in top.text().partition("\x1b[H")[2].partition("\x1b[H")[2]
+            top.press("q")
+            assert top.process.wait(20) == 0
+            assert not re.search(r"\x1b\[(?:\d+;)*[34]\dm", top.text()), "colours, with NO_COLOR"
+            assert top.text().endswith("\x1b[?25h\x1b[?1049l")
+            assert top.process.stderr is not None
+            assert top.process.stderr.read() == b""
+    finally:
+        stop.set()
+        thread.join()
 
 
 def test_a_hub_that_is_not_there_is_one_line(

@@ -188,12 +188,17 @@ def test_what_is_no_mission_is_bad_usage(
 def test_the_data_may_stand_in_a_folder_of_their_name(tmp_path: Path) -> None:
     inside = tmp_path / "autoferry"
     inside.mkdir()
-    (inside / "scenario2_detections.json").touch()
+    times = ((1, 5.0), (2, 95.0), (3, 400.0))  # of a lidar, a radar, a camera
+    (inside / "scenario2_detections.json").write_text(json.dumps([{"sensorID": k, "time": t} for k, t in times]))
     with pytest.raises(DataError, match=r"no scenario3_detections\.json in"):
         plan_mission("autoferry:3", data=str(tmp_path))
     for given in (tmp_path, inside):
         plan = plan_mission("autoferry:2", data=str(given))
         assert str(inside) in plan.clients["lidar"]
+        assert plan.seconds == 90.0
+    (inside / "scenario3_detections.json").touch()
+    with pytest.raises(DataError, match=r"scenario3_detections\.json is no file of detections"):
+        plan_mission("autoferry:3", data=str(tmp_path))
 
 
 def test_each_robot_is_two_clients(tmp_path: Path) -> None:

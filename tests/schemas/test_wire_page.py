@@ -77,10 +77,9 @@ def test_numbers_are_those_of_the_code() -> None:
 
 
 def test_keys_are_those_that_parse() -> None:
-    told = [
-        key.format(realm="a/b", source="s", centre="c", scenario="t", term=7, step=8, name="n", operator="o")
-        for key in re.findall(r"^\| `(\{realm\}[^`]+)` \|", SECTIONS["Keys"], flags=re.M)
-    ]
+    names = {"realm": "a/b", "source": "s", "centre": "c", "scenario": "t", "term": 7, "step": 8, "name": "n"}
+    names |= {"operator": "o", "recorder": "r"}
+    told = [key.format_map(names) for key in re.findall(r"^\| `(\{realm\}[^`]+)` \|", SECTIONS["Keys"], flags=re.M)]
     built = [schemas.local_key("s", what, "a/b") for what in ("tracks", "intensity", "info", "alive")]
     built += [
         schemas.global_key("c", what, "a/b") for what in ("tracks", "log", "status", "alive", "picture", "orders")
@@ -88,6 +87,7 @@ def test_keys_are_those_that_parse() -> None:
     built += [schemas.order_key("c", "o", "a/b"), schemas.global_key("c", "state", "a/b")]
     tokens = ("holds", "7"), ("yields", "7.8"), ("standby", "n")
     built += [schemas.token_key("c", what, name, "a/b") for what, name in tokens]
+    built += [schemas.record_key("r", what, "a/b") for what in ("alive", "state")]
     assert told == [*built, schemas.truth_key("t", "a/b")]
 
 

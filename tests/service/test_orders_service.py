@@ -46,7 +46,8 @@ def test_an_operator_orders_lists_and_withdraws(scene: Scene, capsys: pytest.Cap
     code, _, err = order("delete", "--track", "PILOTS")
     assert code == 1
     assert "order 3 is refused: there is no track PILOTS: known are " in err
-    assert str(track) in err
+    assert "12 (PILOT)" in err
+    assert err.endswith(': did you mean "PILOT"?\n')
     code, out, _ = order("list")
     assert code == 0
     assert [line.split()[:2] for line in out.splitlines()] == [["1", "rename"], ["2", "quarantine"]]
@@ -60,6 +61,12 @@ def test_an_operator_orders_lists_and_withdraws(scene: Scene, capsys: pytest.Cap
     assert [(told[k]["what"], told[k]["done"]) for k in sorted(told)] == [
         *(("rename", True), ("quarantine", True), ("delete", False), ("withdraw", True), ("delete", True)),
     ]
+    code, out, _ = order("mute", "--source", "R1")
+    assert code == 0
+    assert out.endswith(', of which nothing was heard yet (known are r1, r2): did you mean "r1"?\n')
+    assert order("withdraw", out.split(":")[0].removeprefix("order "))[0] == 0
+    code, _, err = order("link", "--local", "rr2", "1", "--to", "2")
+    assert (code, err.endswith('r1, r2: did you mean "r2"?\n')) == (1, True)
     assert told[1]["who"] == "anna"
     assert told[5]["who"]
     count = len(scene.seen.pictures)

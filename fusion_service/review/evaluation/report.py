@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from fusion_service.errors import ReviewError
+from fusion_service.extras import install_hint
 from fusion_service.labels import utc
 from fusion_service.review.evaluation.assess import Assessment, Evaluation
 from fusion_service.review.evaluation.hull_table import TITLE, hull_table
@@ -61,7 +62,7 @@ def need_matplotlib() -> None:
     try:
         import matplotlib  # noqa: F401
     except ImportError as error:
-        raise ReviewError(f"a page needs matplotlib ({error}): pip install 'track-fusion-centre[report]'") from None
+        raise ReviewError(f"a page needs matplotlib ({error}): {install_hint('report')}") from None
 
 
 def report(assessments: Sequence[Assessment]) -> str:

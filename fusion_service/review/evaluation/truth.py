@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from fusion_service.errors import ReviewError
+from fusion_service.extras import install_hint
 from schemas import MessageError, Truth, decode
 from schemas.flat import frame_of, space_of
 
@@ -75,7 +76,7 @@ def _parquet(path: Path) -> Iterator[FlatTable]:
     try:
         from pyarrow import ArrowException, parquet
     except ImportError as error:
-        raise ReviewError(f"Parquet needs pyarrow ({error}): pip install 'track-fusion-centre[record]'") from None
+        raise ReviewError(f"Parquet needs pyarrow ({error}): {install_hint('record')}") from None
     try:
         file = parquet.ParquetFile(path)
         wanted = _wanted(tuple(file.schema_arrow.names), path)

@@ -51,7 +51,8 @@ def test_a_missing_extra_is_told_in_one_line(mission: Path, capsys: Any, monkeyp
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert main(["replay", str(mission), "--verify"]) == 1
     errors = capsys.readouterr().err
-    assert "pip install 'track-fusion-centre[record]'" in errors
+    assert "pip install -e '" in errors
+    assert "[record]'" in errors
     assert len(errors.strip().splitlines()) == 1
 
 
