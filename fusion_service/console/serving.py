@@ -28,6 +28,8 @@ log = logging.getLogger(__name__)
 CONNECTIONS = 64
 """Connections at a time."""
 LEAST_TOKEN = 16
+ANYWHERE = ("0.0.0.0", "::")
+"""Hosts by which all addresses of this computer are meant: it is called by its name then."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +62,8 @@ def run_console(options: ConsoleOptions, stop: threading.Event) -> None:
         raise UsageError(f"the console needs a web server: {install_hint('console')} ({error})") from None
     host, port = options.listen
     token = _token(options.token)
-    doors = Doors(token, not is_loopback(host), frozenset(options.names), _tiles(options.tiles))
+    names = frozenset([*options.names, *([socket.gethostname().lower()] if host in ANYWHERE else [])])
+    doors = Doors(token, not is_loopback(host), names, _tiles(options.tiles))
     state = State()
     listener = Listener(
         state,
@@ -79,6 +82,7 @@ def run_console(options: ConsoleOptions, stop: threading.Event) -> None:
             log_level="warning",
             access_log=False,
             server_header=False,
+            proxy_headers=False,
             ws_max_size=4096,
             ws_per_message_deflate=False,
             limit_concurrency=CONNECTIONS,
@@ -140,7 +144,7 @@ def _tiles(url: str) -> str:
 def _address(options: ConsoleOptions, sock: socket.socket, token: str, locked: bool) -> str:
     """Where the console is, as it is opened; the token stands behind the #, which a browser sends to nobody."""
     host, port = sock.getsockname()[:2]
-    host = {"0.0.0.0": socket.gethostname(), "::": socket.gethostname()}.get(host, host)
+    host = socket.gethostname() if host in ANYWHERE else host
     host = f"[{host}]" if ":" in host else host
     scheme = "https" if options.certificate else "http"
     secret = f"#token={token}" if locked or options.orders else ""
