@@ -8,7 +8,7 @@ import { unit, world } from "/static/tracks.js";
 
 const TOGETHER = 120;
 const LEAST = 3;
-const LEAD = 60;
+const [LEAD, LEAD_LOCAL] = [60, 10];
 const MOST_NAMES = 250;
 const MANY = 1500;
 export const [TENTATIVE, CONFIRMED, COASTING] = [0, 1, 2];
@@ -63,7 +63,7 @@ function trail(context, state, view, row, x, y) {
 
 function vector(context, state, view, row, x, y) {
   const { picture, geo } = state.tracks;
-  const lead = LEAD * view.scale * unit(geo, picture.y[row]);
+  const lead = (geo ? LEAD : LEAD_LOCAL) * view.scale * unit(geo, picture.y[row]);
   const [dx, dy] = [picture.vx[row] * lead, -picture.vy[row] * lead];
   const long = Math.hypot(dx, dy);
   if (!(long > 5) || long > 4000) return;

@@ -19,7 +19,7 @@ const SIGNS = [
   ["small ring", "tentative: not enough seen yet"],
   ["diamond, dashed ellipse", "coasting: no source has it now"],
   ["triangle above", "its identity is in two places"],
-  ["thin line", "where it was, the last minute or so; where it goes in a minute"],
+  ["thin line", "where it was, the last minute or so; where it goes in a minute (10 s in a local frame)"],
   ["lines to sensors", "whom the chosen track comes from, as wide as their influence"],
 ];
 
