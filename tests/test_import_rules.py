@@ -17,7 +17,7 @@ GROUND_FLOOR = {
     for name in (
         *("linalg", "geodesy", "hulls", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
         *("errors", "arrays", "order", "records", "turn", "ways", "source_words", "layout", "compiled", "escape"),
-        *("logs", "hangup", "extras"),
+        *("logs", "hangup", "extras", "labels"),
     )
 }
 STANDS_ON = {
@@ -36,6 +36,9 @@ STANDS_ON = {
     "fusion_service.service": {
         *(*GROUND_FLOOR, "schemas", "fusion_service.bus", "fusion_service.config", "fusion_service.centre"),
         "fusion_service.hints",
+    },
+    "fusion_service.console": {
+        *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.bus", "fusion_service.hints"),
     },
     "fusion_service.recording": {
         *(*GROUND_FLOOR, "schemas", "fusion_service.densities", "fusion_service.bus", "fusion_service.config"),

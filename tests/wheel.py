@@ -15,6 +15,8 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
+STATIC = "fusion_service/console/static"
+"""The console's page, which is no Python."""
 VERSION = """
 import importlib.metadata, fusion_service
 version = importlib.metadata.version("track-fusion-centre")
@@ -67,6 +69,9 @@ def main() -> None:
         for package in ("fusion_service", "schemas", "sensor_clients"):
             assert f"{package}/py.typed" in names, package
         assert "schemas/WIRE.md" in names
+        page = {path.relative_to(ROOT).as_posix() for path in (ROOT / STATIC).rglob("*") if path.is_file()}
+        assert {f"{STATIC}/index.html", f"{STATIC}/leaflet/leaflet.js", f"{STATIC}/leaflet/LICENSE"} <= page
+        assert page <= names, page - names
         assert any(name.startswith("schemas/vectors/") for name in names)
         venv.create(folder / "empty", with_pip=True)
         there = folder / "empty" / "bin"

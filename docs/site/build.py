@@ -33,6 +33,7 @@ SECTIONS = {
         *(
             "tutorial",
             "operating",
+            "console",
             "troubles",
             "top",
             "standby",

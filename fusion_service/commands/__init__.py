@@ -11,6 +11,7 @@ from types import ModuleType
 
 from fusion_service.commands import (
     check,
+    console,
     demo,
     evaluate,
     explain,
@@ -39,6 +40,7 @@ COMMANDS: dict[str, ModuleType] = {
         keys,
         run,
         status,
+        console,
         top,
         listen,
         order,

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from fusion_service.errors import ReviewError
+from fusion_service.labels import Labels
 from fusion_service.recording import read
-from fusion_service.recording.drawing.labels import Labels
 from fusion_service.review.export_maps import geojson_map, kml_map
 from fusion_service.review.export_rows import AS, Exportable, rows_of
 from fusion_service.review.export_tables import csv_table, parquet_table

@@ -206,7 +206,7 @@ def test_circles_of_distance_are_few_and_within_the_view(reach: float) -> None:
 
 
 def test_memory_of_names_and_generations_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("fusion_service.recording.drawing.labels.MAX_GENERATIONS", 3)
+    monkeypatch.setattr("fusion_service.labels.MAX_GENERATIONS", 3)
     monkeypatch.setattr("fusion_service.recording.drawing.scene.MAX_CENTRES", 2)
     base: Any = next(s.message for s in mission(1) if isinstance(s.message, GlobalTracks))
     said: list[Message] = [replace(base, source=f"centre{n}", seq=n) for n in range(4)]

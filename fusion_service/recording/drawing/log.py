@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
+from fusion_service.labels import utc
 from fusion_service.recording.columns import ColumnWriter, Stamp, documents, entity, texts
-from fusion_service.recording.drawing.labels import utc
 from fusion_service.recording.drawing.tracks import Drawing
 from fusion_service.source_words import consistency, source_event, source_health, state_of
 from fusion_service.ways import fused_by, tracklet_health

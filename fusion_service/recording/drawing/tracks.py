@@ -27,13 +27,13 @@ from fusion_service.arrays import Floats
 from fusion_service.colours import SCREEN_NEUTRAL, SCREEN_TRUTH, Colour, centre_colours, screen_source_colours
 from fusion_service.coverage import at_platform
 from fusion_service.geodesy import FrameError
+from fusion_service.labels import Labels
 from fusion_service.recording.columns import ColumnWriter, Stamp, entity
 from fusion_service.recording.drawing.canvas import WIDTH, Canvas
 from fusion_service.recording.drawing.extent import Corners, Extent
 from fusion_service.recording.drawing.focus import FocusView
 from fusion_service.recording.drawing.geometry import Chart, outline, track_moments
 from fusion_service.recording.drawing.hulls import Hulls
-from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.drawing.links import links, links_path
 from fusion_service.recording.drawing.styles import Styles
 from fusion_service.recording.drawing.tables import Table, drawn_components, remember, tabulate

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion_service.recording.drawing.labels import utc
+from fusion_service.labels import utc
 from fusion_service.review.evaluation.gathering import Evaluation
 from fusion_service.review.snapshots import truth_positions
 

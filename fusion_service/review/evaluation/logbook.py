@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service.geodesy import FrameError, transform
-from fusion_service.recording.drawing.labels import Labels
+from fusion_service.labels import Labels
 from fusion_service.review.evaluation.account import Account
 from fusion_service.review.evaluation.latency import Delays, Latency
 from fusion_service.review.evaluation.misses import PlatformPath

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from fusion_service.errors import ReviewError
 from fusion_service.extras import install_hint
-from fusion_service.recording.drawing.labels import utc
+from fusion_service.labels import utc
 from fusion_service.review.evaluation.assess import Assessment, Evaluation
 from fusion_service.review.evaluation.hull_table import TITLE, hull_table
 from fusion_service.review.evaluation.report_tables import html_table, mark

@@ -5,7 +5,7 @@ from __future__ import annotations
 from html import escape
 from itertools import combinations
 
-from fusion_service.recording.drawing.labels import utc
+from fusion_service.labels import utc
 from fusion_service.review.evaluation.assess import Assessment
 from fusion_service.review.evaluation.report_tables import html_table, mark
 from fusion_service.review.evaluation.results import rule_of

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fusion_service.recording.drawing.labels import utc
+from fusion_service.labels import utc
 from fusion_service.review.evaluation.assess import Assessment
 from fusion_service.review.evaluation.comparable import Comparison, compared
 from fusion_service.review.evaluation.hull_table import hull_lines

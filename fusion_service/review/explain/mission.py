@@ -11,10 +11,10 @@ from threading import Event
 
 from fusion_service.config import CentreConfig, ConfigError, centre_config
 from fusion_service.errors import ReviewError, Stopped
+from fusion_service.labels import Labels
 from fusion_service.metrics import chi2_quantile
 from fusion_service.progress import Progress
 from fusion_service.recording import RawMessage, read
-from fusion_service.recording.drawing.labels import Labels
 from fusion_service.recording.steps import Step, Steps
 from fusion_service.recording.survey import RecordedCentre, key_of, survey
 from fusion_service.review.explain.fused_by import FusedBy

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fusion_service.errors import ReviewError
-from fusion_service.recording.drawing.labels import utc
+from fusion_service.labels import utc
 from fusion_service.review.evaluation.assess import Assessment
 from fusion_service.review.evaluation.gathering import Evaluation
 from fusion_service.review.evaluation.misses import CAUSES, Coverages

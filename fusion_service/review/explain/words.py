@@ -9,7 +9,7 @@ import numpy as np
 
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
-from fusion_service.recording.drawing.labels import utc
+from fusion_service.labels import utc
 from fusion_service.review.explain.fused_by import SourceSaid, shares
 from fusion_service.review.explain.histories import GONE, TrackHistory
 from fusion_service.review.explain.mission import RecordedMission, Refusals

@@ -15,8 +15,8 @@ import schemas
 from fusion_service.centre import Order
 from fusion_service.cli import main
 from fusion_service.errors import ReviewError
+from fusion_service.labels import Labels
 from fusion_service.order import LocalId
-from fusion_service.recording.drawing.labels import Labels
 from fusion_service.review.explain import explanation, listing, read_mission
 from schemas import GlobalTracks, LocalTracks, StepLog, Truth
 from schemas.messages import BROKEN, EXCHANGED, GATE_FAILED, MERGED, SPLIT
