@@ -179,7 +179,7 @@ def _updated(messages: Sequence[LocalTracks], some: Sequence[Mask], times: NDArr
     if all(m.updated is None for m in messages):
         return times.copy()
     said = [np.full(len(m.ids), m.time) if m.updated is None else m.updated for m in messages]
-    return np.minimum(_gather(said, some, np.int64), times)
+    return np.asarray(np.minimum(_gather(said, some, np.int64), times))
 
 
 def _told(

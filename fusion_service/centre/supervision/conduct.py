@@ -94,7 +94,7 @@ class Conduct:
             return
         self._records = {name: self._records.get(name, _Record()) for name in names}
         self._refused = {name: self._refused[name] for name in names if name in self._refused}
-        came = {name: one for name in names if (one := self._told(name)) is not None}
+        came = {name: told for name in names if (told := self._told(name)) is not None}
         hold = int(HOLD * 1e9)
         seen = seen_together([*came.values()], self._intake.frame, self._intake.config, time, hold, VARIED, FEW)
         faded: dict[float, float] = {}

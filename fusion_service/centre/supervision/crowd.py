@@ -104,10 +104,8 @@ def _seen(
     stamp, was, identity = _joined(new, "time"), _joined(old, "time"), _joined(new, "identity")
     later = (stamp > was) & (_joined(new, "updated") > _joined(old, "updated"))
     at = marked(later & (_joined(old, "origin") == _joined(new, "origin")) & np.repeat(usual, sizes))
-    change = Change(
-        *(_joined(side, name).take(at, axis=-1) for name in ("mean", "covariance") for side in (old, new)),
-        (stamp[at] - was[at]) / 1e9, _joined(old, "interval")[at],
-    )  # fmt: skip
+    x, y, P, R = (_joined(side, name).take(at, axis=-1) for name in ("mean", "covariance") for side in (old, new))
+    change = Change(x, y, P, R, (stamp[at] - was[at]) / 1e9, _joined(old, "interval")[at])
     found = Moves(at, *judged(change, group[0].source.space, group[0].shift, config), at)
     jumped = counted(counts, at, found, was[at], identity, time, hold, varies)
     calls = np.zeros(len(ids), dtype=np.bool_)
@@ -122,9 +120,11 @@ def _seen(
             continue
         mine = {name: column[start : start + size].copy() for name, column in counts.items()}
         part = slice(edges[k], edges[k + 1])
-        moves = Moves(*(column[part] for column in found)) if rests or says else None
-        if moves is not None:
-            moves = moves._replace(at=moves.at - start, was=moves.was - start)
+        moves: Moves | None = None
+        if rests or says:
+            mine_at, again, speed, sigma, leapt, away, _ = found
+            here = mine_at[part] - start
+            moves = Moves(here, again[part], speed[part], sigma[part], leapt[part], away[part], here)
         yield one.source.name, Seen(moves, mine, jumped[part], says)
 
 
