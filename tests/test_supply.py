@@ -47,7 +47,7 @@ def test_all_that_the_project_asks_for_is_pinned() -> None:
     assert names <= set(pins("constraints.txt"))
     image = {
         *project["dependencies"],
-        *(one for name in ("record", "report", "keys", "metrics") for one in extras[name]),
+        *(one for name in ("record", "report", "keys", "metrics", "console", "top") for one in extras[name]),
     }
     assert {canonical(re.split(r"[\[<>=!~ ]", one)[0]) for one in image} <= set(pins("docker/requirements.txt"))
 

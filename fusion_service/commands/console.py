@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import threading
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT
 from fusion_service.bus.options import bus_options
+from fusion_service.hangup import on_hangup
 from fusion_service.process import argument
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
+
+log = logging.getLogger(__name__)
 
 HELP = "An operator's console in a browser: map, tracks, sources, alarms, log, and orders where they are allowed."
 EXAMPLE = """fusion-service console
@@ -63,6 +67,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.bus.security import check_party, maybe_security
     from fusion_service.console import ConsoleOptions, run_console
     from fusion_service.errors import UsageError
+    from fusion_service.service.notify import notify
     from schemas import global_key
 
     security = maybe_security(args.security)
@@ -92,7 +97,10 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         key=files[1],
         token=files[2],
     )
-    run_console(options, stop)
+    told = "options, certificates and token are read at the start: a change needs a restart"
+    with on_hangup(lambda: log.warning(told)):
+        run_console(options, stop, lambda: notify("READY=1"))
+    notify("STOPPING=1")
 
 
 def _listen(text: str) -> tuple[str, int]:

@@ -6,7 +6,7 @@ import logging
 import secrets
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,8 +52,8 @@ class ConsoleOptions:
     token: Path | None = None
 
 
-def run_console(options: ConsoleOptions, stop: threading.Event) -> None:
-    """Serve until `stop` is set. Raises `UsageError` for what cannot be served, `BusError`, `SecurityError`."""
+def run_console(options: ConsoleOptions, stop: threading.Event, ready: Callable[[], None] = lambda: None) -> None:
+    """Serve until `stop` is set; ready: called when pages are served. Raises `UsageError` for what cannot be served, `BusError`, `SecurityError`."""
     try:
         import uvicorn
 
@@ -95,6 +95,7 @@ def run_console(options: ConsoleOptions, stop: threading.Event) -> None:
         serving.start()
         try:
             print(_address(options, sock, token, doors.locked), flush=True)
+            ready()
             listener.run(stop)
         finally:
             server.should_exit = True
