@@ -18,7 +18,7 @@ MAX_NAMES = 4096
 """Names that are remembered of what anybody on the bus may make up."""
 MOST_ELSEWHERE, MOST_TOLD = 256, 3
 """Tokens of other realms that are remembered, and that are told of."""
-GRACE = 3.0
+GRACE = 5.0
 """Seconds in which a source that is thought to be there has its token, be it that the hub has just come back."""
 
 
