@@ -166,8 +166,9 @@ def copied() -> set[str]:
 
 def test_the_image_gets_what_the_wheel_needs_and_no_more() -> None:
     project = PROJECT["project"]
-    needed = {"pyproject.toml", project["readme"], *project["license-files"]}
-    needed |= set(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])
+    packages = set(PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])
+    licences = {one for one in project["license-files"] if one.split("/")[0] not in packages}
+    needed = {"pyproject.toml", project["readme"], *licences, *packages}
     assert copied() == needed | {
         f"docker/{name}" for name in ("build.txt", "health.py", "requirements.txt", "sbom.json")
     }

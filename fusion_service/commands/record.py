@@ -19,7 +19,7 @@ from fusion_service.process import argument, positive
 
 if TYPE_CHECKING:
     from fusion_service.bus.security import Security
-    from fusion_service.recording import Recorder
+    from fusion_service.recording import Recorder, Rotation
     from fusion_service.recording.signing import Signer
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
@@ -126,26 +126,34 @@ def _signer(key: str | None, security: Security | None) -> Signer | None:
         return None
 
 
+def _rotation(args: argparse.Namespace) -> Rotation | None:
+    """How a recording in parts goes on; None of one in a single file."""
+    from fusion_service.errors import UsageError
+    from fusion_service.recording import Rotation
+    from fusion_service.recording.parts import is_folder
+
+    limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
+    if all(limit is None for limit in limits) and not (args.out and is_folder(args.out)):
+        return None
+    try:
+        return Rotation(*limits)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
+
+
 def run(args: argparse.Namespace, stop: threading.Event) -> None:
     """Record until `stop` is set. Raises `UsageError`, `SecurityError`, `BusError`, `ReviewError`,
     ImportError, OSError."""
     from fusion_service.bus import open_bus
     from fusion_service.bus.security import maybe_security
     from fusion_service.errors import UsageError
-    from fusion_service.recording import Rotation, default_path, run_recorder
+    from fusion_service.recording import default_path, run_recorder
     from fusion_service.recording.live import DEFAULT_ADDRESS, Live
-    from fusion_service.recording.parts import is_folder
     from fusion_service.recording.presence import Presence, host_name
     from fusion_service.service.notify import listening, notify
     from schemas import check_name
 
-    limits = (args.rotate_size, args.rotate_every, args.keep_size, args.keep_for)
-    rotation = None
-    if any(limit is not None for limit in limits) or (args.out and is_folder(args.out)):
-        try:
-            rotation = Rotation(*limits)
-        except ValueError as error:
-            raise UsageError(str(error)) from None
+    rotation = _rotation(args)
     path = Path(args.out) if args.out else default_path(suffix=".rrd" if rotation is None else "")
     try:
         name = check_name(args.name or host_name())

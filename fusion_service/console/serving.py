@@ -53,7 +53,8 @@ class ConsoleOptions:
 
 
 def run_console(options: ConsoleOptions, stop: threading.Event, ready: Callable[[], None] = lambda: None) -> None:
-    """Serve until `stop` is set; ready: called when pages are served. Raises `UsageError` for what cannot be served, `BusError`, `SecurityError`."""
+    """Serve until `stop` is set; ready: called when pages are served. Raises `UsageError` for what cannot be served,
+    `BusError`, `SecurityError`."""
     try:
         import uvicorn
 

@@ -94,8 +94,7 @@ class Recorder:
         import_rerun()
         self.path = Path(path)
         """The file, or the part, that is being written."""
-        self.messages = 0
-        self.bytes = 0
+        self.messages = self.bytes = 0
         self.undecodable: Counter[str] = Counter()
         self.missing = 0
         self._scoring = Scoring(cutoff, every)

@@ -25,12 +25,13 @@ class Terminal:
         self._own, theirs = pty.openpty()
         self._text = ""
         self.resize(width, height)
+        inherited = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
         self.process = subprocess.Popen(
             [sys.executable, "-W", "error", "-c", COMMAND, *words],
             stdin=theirs,
             stdout=theirs,
             stderr=subprocess.PIPE,
-            env={**os.environ, "TERM": "xterm-256color", **environment},
+            env={**inherited, "TERM": "xterm-256color", **environment},
         )
         os.close(theirs)
 
