@@ -1,0 +1,1 @@
+"""A newcomer's first hour, run: `python -m tests.newcomer`."""
