@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterator
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,6 @@ __all__ = [
     "by_size",
     "candidate_pairs",
     "cluster",
-    "in_order",
     "leave_one_out",
     "near_pairs",
     "overlap",
@@ -52,38 +51,13 @@ CHUNK = 4096
 
 
 def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
-    """Groups of equal labels (M,), gathered by their size k: (labels (G,), row indices (G, k)), not to be written to.
+    """Groups of equal labels (M,), gathered by their size k: (labels (G,), row indices (G, k)).
 
     Groups come in order of label within a size, rows in their own order within a group.
     """
-    yield from _grouped(labels)[2]
-
-
-def in_order(labels: NDArray[np.uint64]) -> Ints:
-    """`np.argsort(labels, kind="stable")`, not to be written to."""
-    return _grouped(labels)[1]
-
-
-_Grouped: TypeAlias = tuple[NDArray[Any], Ints, list[tuple[NDArray[Any], Ints]]]
-_KEPT: list[_Grouped] = []
-"""The last few that were asked for: links stay from step to step, and are asked for several times in one."""
-_MOST_KEPT = 2
-
-
-def _grouped(labels: NDArray[Any]) -> _Grouped:
-    """The labels, their order, and their groups by size."""
-    for one in _KEPT:
-        if one[0].dtype == labels.dtype and np.array_equal(one[0], labels):
-            return one
-    order = np.argsort(labels, kind="stable")
-    found = labels.copy(), order, [*_groups(labels, order)]
-    _KEPT[:] = [found, *_KEPT[: _MOST_KEPT - 1]]
-    return found
-
-
-def _groups(labels: NDArray[Label], order: Ints) -> Iterator[tuple[NDArray[Label], Ints]]:
     if not len(labels):
         return
+    order = np.argsort(labels, kind="stable")
     ranked = labels[order]
     new = marked(ranked[1:] != ranked[:-1])
     edges = np.zeros(len(new) + 2, dtype=np.intp)

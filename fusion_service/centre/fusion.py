@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from fusion_service.arrays import among, marked, subset
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
-from fusion_service.centre.association import in_order
 from fusion_service.centre.blobs import Blobs, Shared
 from fusion_service.centre.centre import Centre
 from fusion_service.centre.existence import Entries, update_existence
@@ -221,6 +220,6 @@ class FusionCentre(Centre):
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()
-        inside = inside[in_order(tracks.link[inside])]
+        inside = inside[np.argsort(subset(tracks.link, inside), kind="stable")]
         counts = np.bincount(picture.find(tracks.link[inside]), minlength=len(picture.id))
         return Contributions(counts, rows.source[inside], rows.epoch[inside], tracks.id[inside], influence[inside])

@@ -1,4 +1,4 @@
-"""Many sources that say little, looked at together and each for itself: the same bytes; and groups that are kept."""
+"""Many sources that say little, looked at together and each for itself: the same bytes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import pytest
 
 import schemas
 from fusion_service.centre import FusionCentre, converting
-from fusion_service.centre import association as groups
 from fusion_service.centre.supervision import crowd
 from schemas import Enu, Frame, Local, LocalTracks
 
@@ -133,24 +132,3 @@ def test_together_and_alone_are_the_same(seed: int, settings: dict[str, Any], mo
     alone = flown(seed, **settings)
     assert not gone_on, "each for itself"
     assert [place for place, (a, b) in enumerate(zip(together, alone, strict=True)) if a != b] == []
-
-
-def test_groups_are_those_of_the_labels_now() -> None:
-    """Kept groups are found again by what the labels are, not by whose they were."""
-    rng = np.random.default_rng(5)
-    labels = rng.integers(0, 9, 40).astype(np.uint64)
-    for turn in range(60):
-        if turn % 3 == 0:
-            labels[rng.integers(0, 40, 2)] = rng.integers(0, 9, 2)
-        some = labels[: rng.integers(0, 41)] if turn % 4 else labels
-        order = np.argsort(some, kind="stable")
-        assert (groups.in_order(some) == order).all()
-        found = {
-            int(one): row.tolist() for ids, rows in groups.by_size(some) for one, row in zip(ids, rows, strict=True)
-        }
-        wanted: dict[int, list[int]] = {}
-        for at, label in enumerate(some.tolist()):
-            wanted.setdefault(label, []).append(at)
-        assert found == wanted
-        sizes = [rows.shape[1] for _, rows in groups.by_size(some)]
-        assert sizes == sorted(set(map(len, wanted.values())))
