@@ -167,7 +167,8 @@ def see(hour: Hour, stack: ExitStack) -> None:
     page = browser.page(address, 1200, 800)
     page.until("document.querySelector('#map').dataset.tracks >= 2", 60)
     page.js("document.querySelector('#fit').click()")
-    page.until("/newcomer/.test(document.body.innerText)", 30)
+    page.js("document.querySelector('#tab-sources').click()")
+    page.until("/newcomer/.test(document.querySelector('main').innerText)", 30)
     page.shot(hour.folder / "console.png")
     hour.say(f"console: 2 tracks of newcomer on the map ({hour.folder / 'console.png'})")
 

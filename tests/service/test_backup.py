@@ -32,7 +32,7 @@ HOLDS = ("generation", "checkpoint", "ended", "born")
 
 
 def test_there_is_one_of_each_release() -> None:
-    assert [path.stem for path in KEPT] == ["0.2.0", "0.3.0", "0.4.0", "0.5.0", "0.6.0", "0.7.0"]
+    assert [path.stem for path in KEPT] == ["0.2.0", "0.3.0", "0.4.0", "0.5.0", "0.6.0", "0.7.0", "0.8.0"]
 
 
 @pytest.mark.parametrize("settings", [{}, {"memory": "recursive"}], ids=str)
