@@ -152,7 +152,8 @@ def first_hour(folder: Path, seconds: float = 20.0, tell: Callable[[str], None] 
         assert service.end(20)[0] == 0
         words = ("--truth", str(folder / "gps.csv"), "--profile", str(folder / "mine.toml"))
         code, text = hour.ask(FUSION, "evaluate", str(recording), *words, "--json", str(folder / "scores.json"))
-        hour.say("evaluate: " + next((line for line in text.splitlines() if "passed" in line or "failed" in line), text))
+        verdicts = [line for line in text.splitlines() if "passed" in line or "failed" in line]
+        hour.say("evaluate: " + (verdicts[0].strip() if verdicts else text))
         assert code == 0, text
         found: dict[str, object] = json.loads((folder / "scores.json").read_text("utf-8"))
         return found

@@ -1,5 +1,5 @@
-"""The first client of a newcomer who reads WIRE.md and nothing else: it follows two targets at 2 Hz and writes down where
-they really are. `MISTAKES` are what he gets wrong at first: each a line of the right client and what he wrote for it."""
+"""The first client of a newcomer who reads WIRE.md and nothing else: it follows two targets at 2 Hz and writes down
+where they really are. `MISTAKES` are what he gets wrong at first: a line of the right client, and what he wrote."""
 
 from __future__ import annotations
 
