@@ -84,7 +84,9 @@ def advised(order: Order, view: View, reply: Reply) -> Reply:
     """`reply`, after which who muted a source that nobody knows hears which there are: it may be meant so."""
     if not order.source or order.source in view.sources or order.what not in ("mute", "quarantine"):
         return reply
-    known = ", ".join(sorted(view.sources)[:LISTED]) or "none"
+    if not view.sources:
+        return reply
+    known = ", ".join(sorted(view.sources)[:LISTED])
     more = " ..." if len(view.sources) > LISTED else ""
     return _adding(f" (known are {known}{more}){did_you_mean(order.source, sorted(view.sources))}", reply)
 

@@ -159,7 +159,7 @@ def test_a_rule_of_ones_own_is_judged_exactly_too(monkeypatch: pytest.MonkeyPatc
     process finds the function again by its file."""
     monkeypatch.setattr(sweep, "RULE_NAMES", ("naive", "ci", "fast-ci", "hmd-ga"))
     own = tmp_path / "own.py"
-    own.write_text("def half(means, covariances):\n    return means.mean(axis=0), covariances.mean(axis=0)\n")
+    own.write_text("def half(means, covariances):\n    return means.mean(axis=1), covariances.mean(axis=1)\n")
     result = sweep.run(Run(8, 1, rules=(fuser(f"{own}:half"),), jobs=2))
     rows = [row for row in result.rows if row.name == "own.half" and row.quantity.startswith("worst")]
     assert len(rows) == 3 * 6 + 3

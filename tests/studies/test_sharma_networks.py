@@ -178,7 +178,7 @@ def test_the_table_does_not_depend_on_processes_and_takes_rules_of_ones_own(tmp_
     assert one.notes == two.notes
     assert any(row.name == "diamond: bci:max_correlation=0.4" for row in one.rows)
     file = tmp_path / "own.py"
-    file.write_text("def half(means, covariances):\n    return means.mean(axis=0), covariances.mean(axis=0)\n")
+    file.write_text("def half(means, covariances):\n    return means.mean(axis=1), covariances.mean(axis=1)\n")
     own = networks.run(Run(100, 2, rules=(fuser(f"{file}:half"),), jobs=2), 2)
     assert any(row.name == "star: own.half" for row in own.rows)
     assert [row for row in own.rows if "half" not in row.name] == [row for row in one.rows if "0.4" not in row.name]
