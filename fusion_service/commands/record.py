@@ -204,6 +204,7 @@ def _check_place(path: Path, *, folder: bool, make: bool) -> None:
     """Before a hub is waited for: that Rerun is there, and that `path`, a file or a `folder` of parts, can be written.
     make: the folder that it is in, if need be. Raises ImportError, OSError."""
     import tempfile
+    from importlib.util import find_spec
 
     from fusion_service.recording.columns import import_rerun
 
@@ -220,7 +221,8 @@ def _check_place(path: Path, *, folder: bool, make: bool) -> None:
     except OSError as error:
         why = os.strerror(error.errno or 0)
         raise PermissionError(f"{place} cannot be written ({why}): name another place with --out, or mend it") from None
-    import_rerun()
+    if find_spec("rerun") is None:  # else it is loaded after the bus is heard, for that takes a second
+        import_rerun()
 
 
 class _Attended:

@@ -37,7 +37,11 @@ def clone(folder: Path) -> Path:
 
 
 def script() -> str:
+    """Who reads takes longer than a recorder needs to begin: it hears the sensors from their first word on."""
     text = "".join(block.text for block in BLOCKS if block.language == "sh")
+    starts = "fusion-service record --out mission.rrd --connect $BUS &\n"
+    assert starts in text
+    text = text.replace(starts, f"{starts}until [ -e mission.rrd ]; do sleep 0.1; done\n")
     assert text.count("tcp/127.0.0.1:7447") == 1
     return "set -eu; trap 'kill $(jobs -p) 2>/dev/null || true' EXIT\n" + text.replace(
         "tcp/127.0.0.1:7447", free_endpoint()

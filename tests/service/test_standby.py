@@ -96,7 +96,8 @@ def test_where_the_bus_splits_both_go_on_and_the_later_one_stays(tmp_path: Path,
     eventually(lambda: far.pictures and 9 in far.pictures[-1].targets)
     assert near.pictures[-1].targets[7] != far.pictures[-1].targets[9]
     hubs.link.mend()
-    eventually(lambda: far.ready(), 20)
+    took = eventually(lambda: far.ready(), 90)
+    print("whole again after", took)
     eventually(lambda: near.sees(0, 1, 2, 7, 9) and far.sees(0, 1, 2, 7, 9))
     assert max(terms) == terms[1]
     eventually(lambda: pair.active() == 1)
