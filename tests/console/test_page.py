@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -96,7 +97,15 @@ def page(room: Room) -> Page:
 
 
 def choose(page: Page, track: str) -> None:
-    x, y = page.until(f"fusionConsole.at({json.dumps(track)})")
+    place = f"fusionConsole.at({json.dumps(track)})"
+
+    def resting() -> list[float] | None:
+        """Where it is, once the map has come to rest."""
+        at: list[float] = page.until(place)
+        time.sleep(0.1)
+        return at if page.until(place) == at else None
+
+    x, y = page.wait(resting)
     box = page.js(
         "(() => { const box = document.querySelector('#map').getBoundingClientRect(); return [box.x, box.y]; })()"
     )
@@ -167,7 +176,7 @@ def test_an_order_is_confirmed_given_told_and_withdrawn(room: Room, page: Page) 
     assert "show a global track under a number or callsign" in page.text("#order-dialog .says")
     fields = "document.querySelectorAll('#order-dialog input')"
     for k, words in enumerate(("PILOT 2", "", "as arranged", "anna")):
-        page.js(f"{fields}[{k}].focus()")
+        page.js(f"{fields}[{k}].select()")
         page.type(words)
     page.click("#order-dialog button[type=submit]")
     page.until("/^Order \\d+: /.test(document.querySelector('#order-dialog .answer').innerText)")
@@ -194,8 +203,8 @@ def test_an_order_that_is_refused_says_why(room: Room, page: Page) -> None:
     page.click("#track button.order")
     page.js(PICK % ("#order-dialog select", "merge"))
     fields = "document.querySelectorAll('#order-dialog input')"
-    for k, words in enumerate(("4711", "because", "")):
-        page.js(f"{fields}[{k}].focus()")
+    for k, words in enumerate(("4711", "because", "anna")):  # who it is may stand there from before
+        page.js(f"{fields}[{k}].select()")
         page.type(words)
     page.click("#order-dialog button[type=submit]")
     page.until("document.querySelector('#order-dialog .answer').className.endsWith('refused')")
