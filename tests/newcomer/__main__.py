@@ -152,7 +152,7 @@ def first_hour(folder: Path, seconds: float = 20.0, tell: Callable[[str], None] 
         assert service.end(20)[0] == 0
         words = ("--truth", str(folder / "gps.csv"), "--profile", str(folder / "mine.toml"))
         code, text = hour.ask(FUSION, "evaluate", str(recording), *words, "--json", str(folder / "scores.json"))
-        verdicts = [line for line in text.splitlines() if "passed" in line or "failed" in line]
+        verdicts = [line for line in text.splitlines() if line.startswith("a newcomer's:")]
         hour.say("evaluate: " + (verdicts[0].strip() if verdicts else text))
         assert code == 0, text
         found: dict[str, object] = json.loads((folder / "scores.json").read_text("utf-8"))
