@@ -275,23 +275,23 @@ def test_only_recording_imports_rerun() -> None:
     assert {module for module in users if not below(module, {"fusion_service.recording"})} == set()
 
 
-def test_publisher_loads_neither_scipy_nor_rerun() -> None:
-    code = "import sensor_clients.publisher, sys; print(*sorted({name.split('.')[0] for name in sys.modules}))"
+def loaded_by(module: str) -> set[str]:
+    """What a process has loaded that imports this alone."""
+    code = f"import {module}, sys; print(*sys.modules)"
     run = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
     )
     assert run.returncode == 0, run.stderr
-    loaded = set(run.stdout.split())
+    return set(run.stdout.split())
+
+
+def test_publisher_loads_neither_scipy_nor_rerun() -> None:
+    loaded = {name.split(".")[0] for name in loaded_by("sensor_clients.publisher")}
     assert {"schemas", "sensor_clients", "numpy"} <= loaded
     assert loaded & {"scipy", "rerun", "matplotlib", "pyarrow"} == set()
 
 
 def test_a_service_starts_without_what_takes_longest_to_import() -> None:
-    code = "import fusion_service.service.daemon, sys; print(*sys.modules)"
-    run = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=False, cwd=ROOT
-    )
-    assert run.returncode == 0, run.stderr
-    loaded = set(run.stdout.split())
+    loaded = loaded_by("fusion_service.service.daemon")
     assert {"fusion_service.centre.centre", "scipy.special", "zenoh"} <= loaded
     assert loaded & {"scipy.stats", "rerun", "matplotlib", "pyarrow", "numba"} == set()

@@ -21,6 +21,7 @@ TICK_MESSAGES, TICK_BYTES = 2000, 8 * 2**20
 """What is written at once."""
 STATUS_PERIOD = 10**9
 """Nanoseconds of the mission between two statuses of a variant."""
+UNSAID = Scoring()
 
 
 class ReplayWriter:
@@ -34,7 +35,7 @@ class ReplayWriter:
         *,
         keep_recorded: bool = True,
         draw: bool = True,
-        scoring: Scoring = Scoring(),  # noqa: B008
+        scoring: Scoring = UNSAID,
     ) -> None:
         self._realm = realm
         self._keep_recorded = keep_recorded
