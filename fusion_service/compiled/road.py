@@ -16,7 +16,7 @@ from pathlib import Path
 from types import FunctionType, ModuleType, SimpleNamespace
 from typing import Any
 
-from fusion_service.compiled import groups, kernels, products, three, turns
+from fusion_service.compiled import groups, kernels, merging, products, three, turns
 from fusion_service.compiled.either import FAST
 from fusion_service.compiled.small import functions
 
@@ -26,7 +26,7 @@ CHOICES = ("auto", "on", "off")
 VARIABLE = "FUSION_COMPILED"
 THREAD = "compiler"
 PLAIN = "plain"
-HOMES = (kernels, groups, three, turns, products)
+HOMES = (kernels, groups, three, turns, products, merging)
 
 _LOCK = threading.Lock()
 _NAME = [PLAIN]
@@ -166,21 +166,24 @@ SHAPES = {
     "from_start_of_three": ((4, 3, 1, 2, 1), (2, 3, 2, 2, 1, 1, 1)),
     "jacobi": ((1, 1), (3,)),
     "product_of_all": ((3, 4), (2, 3, 1)),
+    "merged_pivots": ((4, 3, 2, 0), (3,)),
+    "settled": ((2, 0), (3, 2, 0)),
 }
-"""Numbers of axes of what each kernel reads, and then writes; 0: places (G, k). `solve` takes a flag at the end."""
-STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three")
+"""Numbers of axes of what each kernel reads, and then writes; 0: two, of places. `solve` takes a flag at the end."""
+STRIDED = ("invert", "pivots", "ldl", "solve", "from_start_of_three", "merged_pivots")
 """Kernels that copy what they read into room of their own, so that it need not be contiguous."""
 HELPERS = {
     "intersect": ("_turned", "_lowered", "_sum", "_copied", "_solved"),
     "from_start_of_three": ("_larger", "_inverted", "_looked_at", "_least_of_three", "_sought"),
     "product_of_all": ("_condition", "_summed"),
+    "settled": ("_least",),
 }
 """What kernels call, in the order in which it is compiled."""
 
 
 def _signature(numba: Any, name: str) -> Any:
     types = numba.types
-    kinds = [(types.float64, axes) if axes else (types.int64, 2) for axes in SHAPES[name][0]]
+    kinds, results = [[(types.float64, axes) if axes else (types.int64, 2) for axes in side] for side in SHAPES[name]]
     read = [types.Array(kind, axes, "A" if name in STRIDED else "C", readonly=True) for kind, axes in kinds]
-    written = [types.Array(types.float64, axes, "C") for axes in SHAPES[name][1]]
+    written = [types.Array(kind, axes, "C") for kind, axes in results]
     return types.void(*read, *written, *([types.boolean] if name == "solve" else []))

@@ -25,6 +25,7 @@ def functions(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
     return {
         **_inverses(kernels), **_factors(kernels), **_products(kernels), "intersect": _groups(kernels),
         "from_start_of_three": _three(kernels), "jacobi": _turns(kernels), "product_of_all": _whole(kernels),
+        **_mergers(kernels),
     }  # fmt: skip
 
 
@@ -197,3 +198,23 @@ def _whole(kernels: SimpleNamespace) -> Callable[..., Any]:
         return made
 
     return product_of_all
+
+
+def _mergers(kernels: SimpleNamespace) -> dict[str, Callable[..., Any]]:
+    def merged_logdet(P: Floats, x: Floats, w: Floats, i: Any, at: Places, first: int) -> Floats | None:
+        """Logarithms are NumPy's, as on the plain road."""
+        if not _fits(P, x, w) or not len(at):
+            return None
+        d = np.empty((len(x), len(w) - first, len(at)))
+        kernels.merged_pivots(P, x, w, np.array([np.broadcast_to(i, at.shape), at]), d)
+        logs: Floats = np.log(d, out=d)
+        total: Floats = logs[0]
+        for row in logs[1:]:
+            total += row
+        return total
+
+    def settled(new: Floats, i: Places, j: Places, at: Places, cost: Floats, low: Floats, partner: Places) -> bool:
+        kernels.settled(np.ascontiguousarray(new), np.array([i, j, at]), cost, low, partner)
+        return True
+
+    return {"merged_logdet": merged_logdet, "settled": settled}

@@ -9,6 +9,7 @@ import numpy as np
 
 from fusion_service import linalg
 from fusion_service.arrays import Floats, Ints
+from fusion_service.compiled import either
 from fusion_service.densities.mixture import DensityError, Mixture, Mixtures, log_sum
 from fusion_service.linalg import total
 
@@ -80,6 +81,43 @@ def reduce_mixtures(
         return Mixtures(np.log(w) + log_mass, x, P)
 
 
+@either
+def merged_logdet(P: Floats, x: Floats, w: Floats, i: Any, at: Ints, first: int) -> Floats:
+    """log det (C - first, T) of the covariances that come of merging component i, or i (T,), of the elements `at` (T,)
+    with each component from `first` on: of weights w (C, B), means x (n, C, B) and covariances P (n, n, C, B)."""
+    where: Any = slice(None) if len(at) == w.shape[1] else at
+    share = w[first:, where] / (w[i, at] + w[first:, where])
+    rest = 1.0 - share
+    both = share * rest
+    d = x[:, first:, where] - x[:, i, at][:, None]
+    S, mine = P[:, :, first:, where], P[:, :, i, at]
+    M = np.empty_like(S)
+    for k in range(len(M)):
+        M[k, : k + 1] = share * S[k, : k + 1] + rest * mine[k, : k + 1, None] + both * d[k] * d[: k + 1]
+    return linalg.logdet(M)
+
+
+@either
+def settled(new: Floats, i: Ints, j: Ints, at: Ints, cost: Floats, low: Floats, partner: Ints) -> bool:
+    """Write the costs `new` (C, T) of the components i of the elements `at` (T,), into which the components j were
+    merged, into `cost` (B, C, C), and which `partner` (B, C) is now the cheapest for each component, and its cost
+    `low` (B, C)."""
+    new[i, np.arange(len(at))] = np.inf
+    cost[at, i, :] = new.T
+    cost[at, :, i] = new.T
+    partner[at, i], low[at, i] = new.argmin(axis=0), new.min(axis=0)
+    mine, best = partner[at], low[at]
+    costs = new.T
+    nearer = costs < best
+    partner[at], low[at] = np.where(nearer, i[:, None], mine), np.where(nearer, costs, best)
+    one, other = i[:, None], j[:, None]
+    again = ((mine == one) | (mine == other)) & (best < np.inf) & (np.arange(len(new)) != one)
+    e, stale = np.nonzero(again)
+    rows = cost[at[e], stale]
+    partner[at[e], stale], low[at[e], stale] = rows.argmin(axis=1), rows.min(axis=1)
+    return True
+
+
 @dataclass(frozen=True, slots=True)
 class _Parts:
     """Components of B mixtures that are merged in place; what is merged away keeps weight 0."""
@@ -90,22 +128,16 @@ class _Parts:
     logdet: Floats  # (C, B)
     whole: Floats | None  # (n, n, B), the inverse covariances of the mixtures, for Salmond's cost
 
-    def costs(self, i: Any, own: Any, at: Any, js: slice) -> Floats:
-        """Of merging component i of the elements `own` with those in `js`; `at` is `own`, faster."""
-        w, other = self.weights[i, own], self.weights[js, at]
-        d = self.means[:, js, at] - self.means[:, i, own][:, None]
+    def costs(self, i: Any, at: Ints, first: int) -> Floats:
+        """Of merging component i of the elements `at` (T,) with those from `first` on (C - first, T)."""
+        where: Any = slice(None) if len(at) == self.weights.shape[1] else at
+        w, other = self.weights[i, at], self.weights[first:, where]
         if self.whole is not None:
-            out = w * other / (w + other) * total(d * linalg.matvec(self.whole[:, :, None, at], d))
+            d = self.means[:, first:, where] - self.means[:, i, at][:, None]
+            out = w * other / (w + other) * total(d * linalg.matvec(self.whole[:, :, None, where], d))
         else:
-            S, mine = self.covariances[:, :, js, at], self.covariances[:, :, i, own]
-            share = other / (w + other)
-            both = share * (1.0 - share)
-            M = np.empty_like(S)
-            for k in range(len(M)):
-                M[k, : k + 1] = (
-                    share * S[k, : k + 1] + (1.0 - share) * mine[k, : k + 1, None] + both * d[k] * d[: k + 1]
-                )
-            out = 0.5 * ((w + other) * linalg.logdet(M) - w * self.logdet[i, own] - other * self.logdet[js, at])
+            new = merged_logdet(self.covariances, self.means, self.weights, i, at, first)
+            out = 0.5 * ((w + other) * new - w * self.logdet[i, at] - other * self.logdet[first:, where])
         return np.where((w > 0.0) & (other > 0.0), out, np.inf)
 
     def join(self, i: Ints, j: Ints, at: Ints) -> None:
@@ -128,30 +160,19 @@ def _merge(weights: Floats, means: Floats, P: Floats, count: Ints, most: int, me
     left = count[todo]
     whole = linalg.inverse(Mixtures(np.log(weights), means, P).moments()[1]) if method == "salmond" else None
     parts = _Parts(weights, means, P, linalg.logdet(P), whole)
-    cost = np.full((C, C, B), np.inf)
-    everyone = slice(None)
+    cost = np.full((B, C, C), np.inf)
     for i in range(C - 1):
-        cost[i, i + 1 :] = cost[i + 1 :, i] = parts.costs(i, everyone, everyone, slice(i + 1, C))
-    partner = cost.argmin(axis=1)
-    low = np.take_along_axis(cost, partner[:, None], axis=1)[:, 0]
+        cost[:, i, i + 1 :] = cost[:, i + 1 :, i] = parts.costs(i, np.arange(B), i + 1).T
+    partner, low = cost.argmin(axis=2), cost.min(axis=2)
     while len(todo):
-        i = low[:, todo].argmin(axis=0)
-        j = partner[i, todo]
+        i = low[todo].argmin(axis=1)
+        j = partner[todo, i]
         i, j = np.minimum(i, j), np.maximum(i, j)
         parts.join(i, j, todo)
-        cost[j, :, todo] = cost[:, j, todo] = np.inf
-        low[j, todo] = np.inf
+        cost[todo, j] = cost[todo, :, j] = np.inf
+        low[todo, j] = np.inf
         left -= 1
         go = left > most
         todo, left, i, j = todo[go], left[go], i[go], j[go]
-        new = parts.costs(i, todo, everyone if len(todo) == B else todo, slice(0, C))
-        new[i, np.arange(len(todo))] = np.inf
-        cost[i, :, todo] = new.T
-        cost[:, i, todo] = new
-        partner[i, todo], low[i, todo] = new.argmin(axis=0), new.min(axis=0)
-        mine, best = partner[:, todo], low[:, todo]
-        nearer = new < best
-        partner[:, todo], low[:, todo] = np.where(nearer, i, mine), np.where(nearer, new, best)
-        stale, e = np.nonzero(((mine == i) | (mine == j)) & (best < np.inf) & (np.arange(C)[:, None] != i))
-        rows = cost[stale, :, todo[e]]
-        partner[stale, todo[e]], low[stale, todo[e]] = rows.argmin(axis=1), rows.min(axis=1)
+        if len(todo):
+            settled(parts.costs(i, todo, 0), i, j, todo, cost, low, partner)
