@@ -123,11 +123,10 @@ def _tell(
 
     if by := requirements.by_what(args):
         print(f"scored against {by}")
-    print(text(done))
+    print(text(done, "the truth" if args.reference in (None, "each") else "the reference"))
     if truths.note:
         print(truths.note)
-    if args.reference == "each":
-        requirements.each_source(args, done)
+    each = requirements.each_source(args, done) if args.reference == "each" else []
     judged = requirements.told(args, profile, done, truths.told) if profile else []
     if judged:
         print(telling.text(judged))
@@ -138,6 +137,8 @@ def _tell(
         for told, seal in zip(scores["recordings"], seals, strict=False):
             told["seal"] = seal.as_json()
         scores["reference"] = by
+        if each:
+            scores["each_source"] = each
         if profile:
             scores["requirements"] = telling.as_json(judged)
         Path(args.json).write_text(json.dumps(scores, allow_nan=False) + "\n", encoding="utf-8")

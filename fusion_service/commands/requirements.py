@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["Truths", "add", "begin", "by_what", "conclude", "each_source", "listed", "told"]
 
 WITHOUT = "without:"
+EACH = ("rmse_position", "anees", "pairs", "followed", "targets", "identity_switches")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -88,8 +89,8 @@ class Truths:
 
 
 def by_what(args: argparse.Namespace) -> str:
-    """What is scored against, in words; empty for truth."""
-    if args.reference is None:
+    """What is scored against, in words; empty for a mission's own truth, by which `each` has all but its table."""
+    if args.reference in (None, "each"):
         return f"the truth in {args.truth}" if args.truth else ""
     left = args.reference[len(WITHOUT) :] if args.reference.startswith(WITHOUT) else ""
     whose = f"all sources but {left}" if left else "all sources"
@@ -116,39 +117,40 @@ def told(
     return found
 
 
-def each_source(args: argparse.Namespace, done: Sequence[Assessment]) -> None:
-    """Print, of every recording, each source beside the reference of all others."""
+def each_source(args: argparse.Namespace, done: Sequence[Assessment]) -> list[dict[str, Any]]:
+    """Print, of every recording, each source beside the reference of all others; and the same as plain values, with
+    why there is none of a source."""
     from fusion_service.errors import ReviewError
     from fusion_service.review.evaluation import assess
+    from fusion_service.review.evaluation.scoring import plain
     from fusion_service.review.evaluation.tables import aligned, digits, fixed
     from fusion_service.review.smoothing import smoothed_truth
 
+    found: list[dict[str, Any]] = []
     for one in done:
         centre = next((name for name in args.centre or one.book.centres if name in one.book.centres), None)
         rows = [["source", "RMSE, m", "ANEES", "pairs", "followed", "switches"]]
         for name in one.book.sources:
+            told: dict[str, Any] = {"recording": str(one.book.path or ""), "source": name}
+            found.append(told)
             try:
                 truths = smoothed_truth(one.book, centre, name)
                 scored = assess(one.book, c=args.cutoff or one.c, every=args.every, truths=truths)
                 scores = next(iter(scored.evaluations.values())).sources[name]
             except (ReviewError, KeyError) as error:
+                told["why"] = str(error)
                 rows.append([name, "-", "-", str(error)[:60], "", ""])
                 continue
             targets = len(next(iter(scored.evaluations.values())).targets)
-            pairs = str(int((scores.errors == scores.errors).sum()))
+            pairs = int((scores.errors == scores.errors).sum())
+            numbers = (scores.rmse_position, scores.anees, pairs, scores.followed, targets, scores.identity_switches)
+            told |= dict(zip(EACH, map(plain, numbers), strict=True))
             followed = f"{scores.followed} of {targets}"
-            rows.append(
-                [
-                    name,
-                    digits(scores.rmse_position),
-                    fixed(scores.anees),
-                    pairs,
-                    followed,
-                    str(scores.identity_switches),
-                ]
-            )
-        print(f"\n{one.book.path}: each source by a reference smoothed from all others")
+            shown = [digits(scores.rmse_position), fixed(scores.anees), str(pairs), followed]
+            rows.append([name, *shown, str(scores.identity_switches)])
+        print(f"\n{one.book.path}: each source by a reference smoothed from all others, no truth used")
         print("\n".join(aligned(rows)))
+    return found
 
 
 def conclude(said: Sequence[Told]) -> None:

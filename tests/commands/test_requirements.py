@@ -109,6 +109,24 @@ def test_without_truth_the_smoothed_reference_takes_its_place(
     assert main(["evaluate"]) == 2
 
 
+def test_each_source_by_the_others_leaves_the_rest_by_the_missions_own_truth(
+    flown: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first tables are of the truth, and nothing says that they are of a reference; the last one is of it."""
+    own, out = str(flown[0]), tmp_path / "scores.json"
+    assert main(["evaluate", own, "--json", str(out)]) == 0
+    by_truth = json.loads(out.read_text())
+    assert main(["evaluate", own, "--reference", "each", "--json", str(out)]) == 0
+    said, told = capsys.readouterr().out, json.loads(out.read_text())
+    assert "scored against a reference" not in said
+    assert "Tracks against the truth:" in said
+    assert (told["rows"], told["reference"]) == (by_truth["rows"], "")
+    assert [one["source"] for one in told["each_source"]] == ["radar1", "radar2", "radar3"]
+    assert all(one["pairs"] > 0 and one["rmse_position"] > 0 for one in told["each_source"])
+    assert main(["evaluate", own, "--reference", "smoothed"]) == 0
+    assert "Tracks against the reference:" in capsys.readouterr().out
+
+
 def test_the_shipped_profiles_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--profile", "list"]) == 0
     said = capsys.readouterr().out
