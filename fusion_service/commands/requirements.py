@@ -72,7 +72,7 @@ class Truths:
 
     def __init__(self, args: argparse.Namespace, file: TruthFile) -> None:
         self.told: list[list[Truth]] = []
-        self.names, self.note = file.names, file.note
+        self.names, self.note, self.table = file.names, file.note, file.table
         self._args, self._file = args, file
 
     def messages(self, book: Logbook) -> list[Truth]:

@@ -43,8 +43,8 @@ def is_text_table(path: Path) -> bool:
 
 @contextmanager
 def open_table(path: Path) -> Iterator[tuple[TextIO, Heading]]:
-    """The file behind its heading, and the heading; of an empty one no names. What is no text is read all the same, with
-    marks in the place of what cannot be. Raises OSError."""
+    """The file behind its heading, and the heading; of an empty one no names. What is no text is read all the same,
+    with marks in the place of what cannot be. Raises OSError."""
     with path.open("rb") as raw:
         encoding = "utf-16" if raw.read(2) in UTF16 else "utf-8-sig"
     with path.open(newline="", encoding=encoding, errors="replace") as file:

@@ -7,8 +7,9 @@
     vx, vy, vz      m/s along the same axes, all or none; with x, y only
 
 The columns may stand in any order, apart by commas, semicolons or tabs (`csv_text` opens what spreadsheets make of
-that); others are left alone. Of rows that say the same twice one counts. Where no velocities are given each is the slope of a straight line through five fixes, the one in the middle and two on either side (fewer at an
-end and at a gap; of a fix alone there is none): smoothed over four intervals, and so behind in a turn.
+that); others are left alone. Of rows that say the same twice one counts. Where no velocities are given each is the
+slope of a straight line through five fixes, the one in the middle and two on either side (fewer at an end and at a gap;
+of a fix alone there is none): smoothed over four intervals, and so behind in a turn.
 """
 
 from __future__ import annotations
@@ -216,8 +217,8 @@ def _gaps(times: NDArray[np.int64], ids: NDArray[np.uint64]) -> str:
         return ""
     have = "has a gap" if len(longest) == 1 else "have gaps"
     return (
-        f"; {plural(len(longest), 'object')} {have} of up to {max(longest):.4g} s, in which it is not known where they "
-        "were: a track of theirs then has no target, and counts as false"
+        f"; {plural(len(longest), 'object')} {have} of up to {max(longest):.4g} s, in which nobody knows where they "
+        "were: their tracks count as false then, unless all have the gap, when nothing is scored"
     )
 
 

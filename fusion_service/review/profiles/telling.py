@@ -140,9 +140,10 @@ def as_json(told: Sequence[Told]) -> list[dict[str, Any]]:
     ]
 
 
-def against(reference: str) -> list[str]:
-    """The page's word of what all is scored against, where it is not the recording's own truth."""
-    return [f'<p class="lead">Scored against {escape(reference)}.</p>'] if reference else []
+def against(reference: str, odd: Sequence[str] = ()) -> list[str]:
+    """The page's word of what all is scored against, where it is not the recording's own truth; odd: of that truth."""
+    said = [f"Scored against {reference}.", *odd] if reference else []
+    return [f'<p class="lead">{escape(one)}</p>' for one in said]
 
 
 def page(told: Sequence[Told]) -> list[str]:
