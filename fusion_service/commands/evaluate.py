@@ -136,7 +136,7 @@ def _tell(
     for words in odd:
         print(words, file=sys.stderr)
     each = requirements.each_source(args, done) if args.reference == "each" else []
-    judged = requirements.told(args, profile, done, truths.told) if profile else []
+    judged = requirements.told(args, profile, done, truths) if profile else []
     if judged:
         print(telling.text(judged))
     for recording, seal in zip(args.recordings, seals, strict=False):

@@ -97,9 +97,7 @@ def by_what(args: argparse.Namespace) -> str:
     return f"a reference smoothed from {whose}, which does not see what these have in common"
 
 
-def told(
-    args: argparse.Namespace, profile: Profile, done: Sequence[Assessment], truths: Sequence[Sequence[Truth]]
-) -> list[Told]:
+def told(args: argparse.Namespace, profile: Profile, done: Sequence[Assessment], truths: Truths) -> list[Told]:
     """Every centre of every recording under the profile. Raises `ReviewError` where nothing can be scored."""
     from fusion_service.review.profiles import judge
     from fusion_service.review.profiles.observing import observe
@@ -107,13 +105,15 @@ def told(
 
     sources = any(one.kind == "tracked_through" for one in profile.requirements)
     found = []
-    for one, given in zip(done, truths, strict=True):
+    for one, given in zip(done, truths.told, strict=False):
         wanted = [name for name in one.book.centres if not args.centre or name in args.centre]
         for name in wanted:
             cutoff = args.cutoff or profile.cutoff or one.c
             seen = observe(one.book, name, given or one.book.truths, cutoff, every=args.every, sources=sources)
             path = Path(one.book.path or "mission").name
-            found.append(Told(profile, path, name, cutoff, by_what(args), judge(profile, seen)))
+            found.append(
+                Told(profile, path, name, cutoff, by_what(args), judge(profile, seen, truths.names), truths.names)
+            )
     return found
 
 

@@ -109,6 +109,32 @@ def test_without_truth_the_smoothed_reference_takes_its_place(
     assert main(["evaluate"]) == 2
 
 
+def test_targets_that_have_names_are_called_by_them(
+    flown: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Truth from a table of names: in words, on the page, in JSON, and under [identities]."""
+    table, profile = tmp_path / "gps.csv", tmp_path / "radars.toml"
+    lines = ["time,id,x,y"]
+    for sent in mission(40):
+        if isinstance(sent.message, Truth):
+            at = [sent.message.space.index(name) for name in "xy"]
+            for one, state in zip(sent.message.ids.tolist(), sent.message.means, strict=True):
+                lines.append(
+                    f"{sent.message.time},boat {one},{state[at[0]]!r},{state[at[1]]!r}".replace("np.float64", "")
+                )
+    table.write_text("\n".join(lines))
+    who = '[[requirement]]\nkind = "identity"\nverdict = "none"\nshare_min = 0.5\n[identities]\n"boat 2" = "mmsi:1"\n'
+    profile.write_text(PROFILE + MORE + who)
+    out, page = tmp_path / "scores.json", tmp_path / "report.html"
+    files = ["--truth", str(table), "--json", str(out), "--html", str(page)]
+    assert main(["evaluate", str(flown[0]), "--profile", str(profile), *files]) == 1
+    assert "exact: not kept by target boat " in capsys.readouterr().out
+    assert '<td class="left">boat 1</td>' in page.read_text()
+    (told,) = json.loads(out.read_text())["requirements"]
+    assert told["names"]["2"] == "boat 2"
+    assert set(told["requirements"][-1]["targets"]) == {"2"}
+
+
 def test_each_source_by_the_others_leaves_the_rest_by_the_missions_own_truth(
     flown: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
