@@ -119,9 +119,8 @@ def test_targets_that_have_names_are_called_by_them(
         if isinstance(sent.message, Truth):
             at = [sent.message.space.index(name) for name in "xy"]
             for one, state in zip(sent.message.ids.tolist(), sent.message.means, strict=True):
-                lines.append(
-                    f"{sent.message.time},boat {one},{state[at[0]]!r},{state[at[1]]!r}".replace("np.float64", "")
-                )
+                x, y = state[at].tolist()
+                lines.append(f"{sent.message.time},boat {one},{x!r},{y!r}")
     table.write_text("\n".join(lines))
     who = '[[requirement]]\nkind = "identity"\nverdict = "none"\nshare_min = 0.5\n[identities]\n"boat 2" = "mmsi:1"\n'
     profile.write_text(PROFILE + MORE + who)

@@ -161,15 +161,16 @@ def page(told: Sequence[Told]) -> list[str]:
             f"; against {each.reference}" if each.reference else ""
         )
         body.append(f'<p class="lead">{escape(about)}.</p>')
-        head = ("requirement", "area", "asked", "found", "samples", "how sure", "verdict")
+        head = ("requirement", "verdict", "area", "asked", "found", "samples", "how sure")
         rows, sources = [], []
         for one in each.judged:
             need = one.requirement
             source = need.source + (f" (not verified: {need.unverified})" if need.unverified else "")
-            cells = [need.name, need.area, asked(need), found(need, one.whole), _samples(one.whole, need)]
+            cells = [need.area, asked(need), found(need, one.whole), _samples(one.whole, need)]
             marked = f'<td class="{MARKS[one.verdict]}">{one.verdict}</td>'
             sure = f'<td class="left" style="white-space:normal;min-width:14em">{escape(one.whole.words)}</td>'
-            rows.append("".join(f'<td class="left">{escape(cell)}</td>' for cell in cells) + sure + marked)
+            plain = "".join(f'<td class="left">{escape(cell)}</td>' for cell in cells)
+            rows.append(f'<td class="left">{escape(need.name)}</td>{marked}{plain}{sure}')
             sources.append(f"<dt>{escape(need.name)}</dt><dd>{escape(source)}</dd>" if source else "")
         body.append(_table([f'<th class="left">{cell}</th>' for cell in head], rows))
         body.append(f'<dl class="facts">{"".join(sources)}</dl>')

@@ -76,7 +76,7 @@ def test_degrees_that_mean_another_place_are_found_out(tmp_path: Path) -> None:
 )
 def test_an_error_of_its_clock_is_found(tmp_path: Path, late: float, words: str) -> None:
     found = said(table(tmp_path / "a.csv", late))
-    assert found.startswith("the tracks would be 5 m from the truth instead of 1")
+    assert found.startswith("the tracks would be 5.00 m from the truth instead of 10")
     assert words in found
 
 
