@@ -301,7 +301,7 @@ def _times(path: Path, rows: Sequence[tuple[int, str]]) -> tuple[NDArray[np.int6
     """Times, ns, of (line, text), and their unit; all of one kind."""
     line, first = rows[0]
     read, unit = _reader(path, line, first)
-    found = []
+    found: list[int] = []
     for line, text in rows:
         try:
             value = read(text)

@@ -110,9 +110,10 @@ def scored_truth(
     if every is None and pictures is None:
         raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
     paths = truth_path(truths, reference.frame, reference.axes, reference.speeds)
-    if not paths:
+    if not truths:
         raise NothingToScoreError("no truth to score against")
-    first, last = min(int(known[0]) for known, _ in paths.values()), max(int(known[-1]) for known, _ in paths.values())
+    ends = [known for known, _ in paths.values()] or [np.sort(np.array([truth.time for truth in truths]))]
+    first, last = min(int(known[0]) for known in ends), max(int(known[-1]) for known in ends)
     if every is None:
         assert pictures is not None
         times = pictures[(pictures >= first) & (pictures <= last)]
@@ -127,7 +128,9 @@ def scored_truth(
             "no time to score: no picture of the centre, or no multiple of every, while there is truth"
         )
     times = times[_told(truths, times, gap)]
-    states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
+    nobody = [np.zeros((len(times), 0, len(reference.axes) + len(reference.speeds)))]
+    found = [truth_positions(*path, times, gap)[:, None] for path in paths.values()]
+    states = np.concatenate(nobody + found, axis=1)
     states[~np.isfinite(states[:, :, : len(reference.axes)]).all(axis=2)] = np.nan
     return ScoredTruth(times, tuple(paths), states, true_hulls(truths, reference.frame, times, tuple(paths)))
 

@@ -269,7 +269,7 @@ class _Walk:
         """(K T,): where the frame has none, by truth's own z."""
         frame, found = self._reference.frame, np.full(len(flat), np.nan)
         place = flat
-        if self._d == 2:
+        if self._d == 2 and len(self._scored.targets):
             paths = truth_path(truths, frame, self._reference.axes, ("z",))
             moved = [truth_positions(*paths[one], self._scored.times, np.inf) for one in self._scored.targets]
             place = np.stack(moved, axis=1).reshape(-1, 3)

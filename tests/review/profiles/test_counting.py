@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from fusion_service.errors import ReviewError
+from fusion_service.review.evaluation.assess import assess
 from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.evaluation.results import text
 from fusion_service.review.profiles import Area, Judged, Profile, Requirement, judge
 from fusion_service.review.profiles.observing import Observed, observe
 from fusion_service.review.profiles.profile import KINDS
@@ -267,6 +269,19 @@ def test_a_track_with_a_target_is_false_too_where_it_is_farther_than_that() -> N
     assert (found.whole.found, found.whole.samples) == (0.25, 4)
     found = one(mission, need("false_tracks", share_max=0.5), c=100.0)
     assert found.whole.found == 0.0
+
+
+def test_where_truth_says_that_nobody_is_there_every_track_is_false() -> None:
+    """A trial without any target, as false tracks are counted on."""
+    mission: list[Message] = [truth(t, [], []) for t in range(5)]
+    mission += [picture(t, [5], [[0.0, 0.0]]) if t < 2 else picture(t, [], []) for t in range(5)]
+    found = one(mission, need("false_tracks", share_max=0.5), c=100.0)
+    assert (found.whole.found, found.whole.samples) == (1.0, 2)
+    assert one(mission, need("detection", share_min=0.5)).whole.samples == 0
+    scored = assess(Logbook(mission), c=100.0)
+    assert scored.unscored is None
+    assert scored.evaluations["centre"].fused.gospa_false == pytest.approx(2 / 5 * 100.0**2 / 2)
+    assert text([scored]).startswith("Truth tells of no target; shown were 2 fused tracks (ci)")
 
 
 def test_of_a_target_that_nobody_ever_tracked_all_updates_are_missing() -> None:
