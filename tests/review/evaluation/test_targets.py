@@ -105,8 +105,8 @@ def test_gaps_of_truth_end_a_gap_and_no_time_is_counted_twice() -> None:
 
 
 def test_a_track_that_was_suspended_is_told_as_the_cause() -> None:
-    """From 5 to 8 s (lost from 4 to 9) the centre does not show the track, whose existence is too low; a has the target all the time, by a
-    track that is said to have fed it in the step before, and b not."""
+    """From 5 to 8 s the centre does not show the track (lost from 4 to 9), whose existence is too low; a has the target
+    all the time, by a track that is said to have fed it in the step before, and b not."""
     said: list[Message] = [info("a"), info("b")]
     for second in range(SECONDS + 1):
         hidden = 5 <= second < 9
