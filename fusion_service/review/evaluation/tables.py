@@ -113,8 +113,7 @@ def sentence(row: ScoredCentre) -> str:
             text += [f"RMSE {metres(one.rmse_position)}", consistent(one.anees, one.bounds)]
         return "; ".join(text) + "."
     if not evaluation.targets:
-        shown = int(fused.series.shown.sum())
-        return f"Truth tells of no target; shown were {shown} fused tracks ({row.rule}), summed over the scored times."
+        return f"Truth tells of no target; fused tracks ({row.rule}) were shown {int(fused.series.shown.sum())} times."
     shared = evaluation.shared["seen_by_2_or_more"]
     text = [f"Fused tracks ({row.rule}) followed {fused.followed} of {len(evaluation.targets)} targets"]
     if np.isfinite(fused.rmse_position):

@@ -281,7 +281,7 @@ def test_where_truth_says_that_nobody_is_there_every_track_is_false() -> None:
     scored = assess(Logbook(mission), c=100.0)
     assert scored.unscored is None
     assert scored.evaluations["centre"].fused.gospa_false == pytest.approx(2 / 5 * 100.0**2 / 2)
-    assert text([scored]).startswith("Truth tells of no target; shown were 2 fused tracks (ci)")
+    assert text([scored]).startswith("Truth tells of no target; fused tracks (ci) were shown 2 times.")
 
 
 def test_of_a_target_that_nobody_ever_tracked_all_updates_are_missing() -> None:
