@@ -20,7 +20,7 @@ import numpy as np
 from fusion_service.arrays import Floats
 from fusion_service.review.evaluation.gps_table import GpsTable
 from fusion_service.review.evaluation.logbook import Logbook
-from fusion_service.review.evaluation.tables import metres
+from fusion_service.review.evaluation.tables import digits
 from fusion_service.review.snapshots import Times, truth_path, truth_positions
 from schemas import Frame, GlobalTracks, Truth, merged
 from schemas.messages import TENTATIVE
@@ -137,6 +137,6 @@ def _late(shown: Sequence[_Shown], truths: Sequence[Truth], frame: Frame, c: flo
         return ""
     known = next((f": {words}" for size, words in KNOWN.items() if abs(dt - size) < NEAR_S), "")
     return (
-        f"the tracks would be {metres(last)} from the truth instead of {metres(first)} if the truth were stamped "
+        f"the tracks would be {digits(last)} m from the truth instead of {digits(first)} m if the truth were stamped "
         f"{abs(dt):.3g} s {'earlier' if dt > 0 else 'later'}{known or ': a clock, or tracks that lag?'}"
     )
