@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
+import sys
 import threading
 from dataclasses import replace
 from pathlib import Path
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
     from fusion_service.recording.finding import Finding
     from fusion_service.review.evaluation import Assessment
     from fusion_service.review.profiles import Profile
+    from schemas import Truth
 
 __all__ = ["EXAMPLE", "HELP", "add", "run"]
 
@@ -30,6 +33,8 @@ EXAMPLE = (
     "  fusion-service evaluate mission.rrd --profile en-route --html report.html    requirements, passed or failed\n"
     "  fusion-service evaluate mission.rrd --reference each       no truth: every source by all others"
 )
+ODD = 4.0
+"""ANEES beyond which it is asked whether the given truth fits."""
 SAMPLE = 20_000
 """Tracks of each source on the map, about."""
 
@@ -123,12 +128,15 @@ def _tell(
 
     if by := requirements.by_what(args):
         print(f"scored against {by}")
-    print(text(done))
+    print(text(done, "the truth" if args.reference in (None, "each") else "the reference"))
     if truths.note:
         print(truths.note)
-    if args.reference == "each":
-        requirements.each_source(args, done)
-    judged = requirements.told(args, profile, done, truths.told) if profile else []
+    fits = zip(done if args.truth else (), truths.told, strict=False)
+    odd = [f"{args.truth}: {words}" for one, given in fits if (words := _misfit(one, given, truths))]
+    for words in odd:
+        print(words, file=sys.stderr)
+    each = requirements.each_source(args, done) if args.reference == "each" else []
+    judged = requirements.told(args, profile, done, truths) if profile else []
     if judged:
         print(telling.text(judged))
     for recording, seal in zip(args.recordings, seals, strict=False):
@@ -137,7 +145,9 @@ def _tell(
         scores = results(done)
         for told, seal in zip(scores["recordings"], seals, strict=False):
             told["seal"] = seal.as_json()
-        scores["reference"] = by
+        scores |= {"reference": by, "misfit": odd}
+        if each:
+            scores["each_source"] = each
         if profile:
             scores["requirements"] = telling.as_json(judged)
         Path(args.json).write_text(json.dumps(scores, allow_nan=False) + "\n", encoding="utf-8")
@@ -145,7 +155,18 @@ def _tell(
     if args.html:
         from fusion_service.review.evaluation.report import report
 
-        Path(args.html).write_text(report(done, [*telling.against(by), *telling.page(judged)]), encoding="utf-8")
+        Path(args.html).write_text(report(done, [*telling.against(by, odd), *telling.page(judged)]), encoding="utf-8")
         print(f"page:   {args.html}")
     if profile:
         requirements.conclude(judged)
+
+
+def _misfit(one: Assessment, given: list[Truth], truths: Truths) -> str:
+    """What is to be said of a truth that hardly fits a mission, "" where it does."""
+    from fusion_service.review.evaluation.truth_fit import misfit
+
+    centre, found = next(iter(one.evaluations.items()), ("", None))
+    if found is None or not centre:
+        return ""
+    lost = math.isnan(found.fused.anees)
+    return misfit(one.book, centre, given, truths.table, one.c, lost) if lost or found.fused.anees > ODD else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import threading
 from pathlib import Path
 
@@ -80,7 +81,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     print(explanation(mission))
     if args.out is not None:
         count = write_view(mission, args.out, stop)
-        print(f"\n{count} messages of this track alone: {args.out}   (look at it: rerun {args.out})")
+        print(f"\n{count} messages of this track alone: {args.out}   (look at it: rerun {shlex.quote(args.out)})")
 
 
 def _target(args: argparse.Namespace, stop: threading.Event) -> str:

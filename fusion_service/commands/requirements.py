@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 __all__ = ["Truths", "add", "begin", "by_what", "conclude", "each_source", "listed", "told"]
 
 WITHOUT = "without:"
+EACH = ("rmse_position", "anees", "pairs", "followed", "targets", "identity_switches")
 
 
 def add(parser: argparse.ArgumentParser) -> None:
@@ -71,7 +72,7 @@ class Truths:
 
     def __init__(self, args: argparse.Namespace, file: TruthFile) -> None:
         self.told: list[list[Truth]] = []
-        self.names, self.note = file.names, file.note
+        self.names, self.note, self.table = file.names, file.note, file.table
         self._args, self._file = args, file
 
     def messages(self, book: Logbook) -> list[Truth]:
@@ -88,17 +89,15 @@ class Truths:
 
 
 def by_what(args: argparse.Namespace) -> str:
-    """What is scored against, in words; empty for truth."""
-    if args.reference is None:
+    """What is scored against, in words; empty for a mission's own truth, by which `each` has all but its table."""
+    if args.reference in (None, "each"):
         return f"the truth in {args.truth}" if args.truth else ""
     left = args.reference[len(WITHOUT) :] if args.reference.startswith(WITHOUT) else ""
     whose = f"all sources but {left}" if left else "all sources"
     return f"a reference smoothed from {whose}, which does not see what these have in common"
 
 
-def told(
-    args: argparse.Namespace, profile: Profile, done: Sequence[Assessment], truths: Sequence[Sequence[Truth]]
-) -> list[Told]:
+def told(args: argparse.Namespace, profile: Profile, done: Sequence[Assessment], truths: Truths) -> list[Told]:
     """Every centre of every recording under the profile. Raises `ReviewError` where nothing can be scored."""
     from fusion_service.review.profiles import judge
     from fusion_service.review.profiles.observing import observe
@@ -106,49 +105,52 @@ def told(
 
     sources = any(one.kind == "tracked_through" for one in profile.requirements)
     found = []
-    for one, given in zip(done, truths, strict=True):
+    for one, given in zip(done, truths.told, strict=False):
         wanted = [name for name in one.book.centres if not args.centre or name in args.centre]
         for name in wanted:
             cutoff = args.cutoff or profile.cutoff or one.c
             seen = observe(one.book, name, given or one.book.truths, cutoff, every=args.every, sources=sources)
             path = Path(one.book.path or "mission").name
-            found.append(Told(profile, path, name, cutoff, by_what(args), judge(profile, seen)))
+            found.append(
+                Told(profile, path, name, cutoff, by_what(args), judge(profile, seen, truths.names), truths.names)
+            )
     return found
 
 
-def each_source(args: argparse.Namespace, done: Sequence[Assessment]) -> None:
-    """Print, of every recording, each source beside the reference of all others."""
+def each_source(args: argparse.Namespace, done: Sequence[Assessment]) -> list[dict[str, Any]]:
+    """Print, of every recording, each source beside the reference of all others; and the same as plain values, with
+    why there is none of a source."""
     from fusion_service.errors import ReviewError
     from fusion_service.review.evaluation import assess
+    from fusion_service.review.evaluation.scoring import plain
     from fusion_service.review.evaluation.tables import aligned, digits, fixed
     from fusion_service.review.smoothing import smoothed_truth
 
+    found: list[dict[str, Any]] = []
     for one in done:
         centre = next((name for name in args.centre or one.book.centres if name in one.book.centres), None)
         rows = [["source", "RMSE, m", "ANEES", "pairs", "followed", "switches"]]
         for name in one.book.sources:
+            told: dict[str, Any] = {"recording": str(one.book.path or ""), "source": name}
+            found.append(told)
             try:
                 truths = smoothed_truth(one.book, centre, name)
                 scored = assess(one.book, c=args.cutoff or one.c, every=args.every, truths=truths)
                 scores = next(iter(scored.evaluations.values())).sources[name]
             except (ReviewError, KeyError) as error:
+                told["why"] = str(error)
                 rows.append([name, "-", "-", str(error)[:60], "", ""])
                 continue
             targets = len(next(iter(scored.evaluations.values())).targets)
-            pairs = str(int((scores.errors == scores.errors).sum()))
+            pairs = int((scores.errors == scores.errors).sum())
+            numbers = (scores.rmse_position, scores.anees, pairs, scores.followed, targets, scores.identity_switches)
+            told |= dict(zip(EACH, map(plain, numbers), strict=True))
             followed = f"{scores.followed} of {targets}"
-            rows.append(
-                [
-                    name,
-                    digits(scores.rmse_position),
-                    fixed(scores.anees),
-                    pairs,
-                    followed,
-                    str(scores.identity_switches),
-                ]
-            )
-        print(f"\n{one.book.path}: each source by a reference smoothed from all others")
+            shown = [digits(scores.rmse_position), fixed(scores.anees), str(pairs), followed]
+            rows.append([name, *shown, str(scores.identity_switches)])
+        print(f"\n{one.book.path}: each source by a reference smoothed from all others, no truth used")
         print("\n".join(aligned(rows)))
+    return found
 
 
 def conclude(said: Sequence[Told]) -> None:

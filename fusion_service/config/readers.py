@@ -10,6 +10,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import fields
+from difflib import get_close_matches
 from typing import Any, TypeVar
 
 from fusion_service.bus.endpoint import DEFAULT_ENDPOINT, check_endpoint
@@ -69,7 +70,9 @@ def choice(*known: str) -> Callable[[Any], str]:
 
     def read(value: Any) -> str:
         if value not in known:
-            raise ValueError(f"is {value!r}, must be one of: {', '.join(known)}")
+            near = get_close_matches(value, known, 1) if isinstance(value, str) else []
+            meant = f": did you mean {near[0]}?" if near else ""
+            raise ValueError(f"is {value!r}, must be one of: {', '.join(known)}{meant}")
         return str(value)
 
     read.__doc__ = " | ".join(known)
@@ -84,6 +87,8 @@ def read_rule(value: Any) -> str:
         if value in RULES:
             return value
         raise ValueError(f"is {value!r}, a rule of one's own that is not loaded: {NOT_LOADED}")
+    if isinstance(value, str) and value.endswith(".py"):
+        raise ValueError(f"is {value!r}: say which function of it, as in {value}:fuse")
     return choice(*RULES, "auto")(value)
 
 

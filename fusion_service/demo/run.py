@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -198,5 +199,5 @@ def _report(plan: MissionPlan, rule: str, recording: Path, folder: Path, json_pa
         json_path.parent.mkdir(parents=True, exist_ok=True)
         json_path.write_text(json.dumps(result, indent=1) + "\n")
         print(f"scores:    {json_path}")
-    print(f"map:       {picture}\nrecording: {recording}   (look at it: rerun {recording})")
+    print(f"map:       {picture}\nrecording: {recording}   (look at it: rerun {shlex.quote(str(recording))})")
     return result

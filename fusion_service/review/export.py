@@ -17,6 +17,7 @@ from fusion_service.recording import read
 from fusion_service.review.export_maps import geojson_map, kml_map
 from fusion_service.review.export_rows import AS, Exportable, rows_of
 from fusion_service.review.export_tables import csv_table, parquet_table
+from fusion_service.review.outputs import check_page
 from schemas import GlobalTracks, LocalTracks, MessageError, Truth, Wholes, decode
 from schemas.flat import track_columns
 
@@ -40,10 +41,14 @@ def export(
     """Write the tracks of recording `path` to `out`, a new .csv, .parquet, .geojson or .kml file.
 
     what: "global" (of `centre`, which must be named where there are several), "truth", or the name of a source.
-    Raises `ReviewError` for a recording that has none of these, and what `read` raises; FileExistsError for `out`.
+    Raises `ReviewError` for a recording that has none of these and for `out` in no folder, and what `read` raises;
+    FileExistsError for `out`.
     """
     if out.suffix not in FORMATS:
         raise ReviewError(f"{out}: tracks are exported to a .csv, .parquet, .geojson or .kml file")
+    if out.exists():
+        raise FileExistsError(f"{out} exists already: name another file, or move it away")
+    check_page(out)
     labels = Labels()
     left_out: Counter[str] = Counter()
     found = _chosen(path, what, centre, left_out)
@@ -51,8 +56,6 @@ def export(
     if first is None:
         there = ", ".join(sorted(left_out)) or "none at all"
         raise ReviewError(f"{path} has no tracks of {centre or what!r}; there are: {there}")
-    if out.exists():
-        raise FileExistsError(f"{out} exists already: name another file, or move it away")
     rows = times = 0
     part = out.with_name(f".{out.name}")
     try:

@@ -109,6 +109,49 @@ def test_without_truth_the_smoothed_reference_takes_its_place(
     assert main(["evaluate"]) == 2
 
 
+def test_targets_that_have_names_are_called_by_them(
+    flown: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Truth from a table of names: in words, on the page, in JSON, and under [identities]."""
+    table, profile = tmp_path / "gps.csv", tmp_path / "radars.toml"
+    lines = ["time,id,x,y"]
+    for sent in mission(40):
+        if isinstance(sent.message, Truth):
+            at = [sent.message.space.index(name) for name in "xy"]
+            for one, state in zip(sent.message.ids.tolist(), sent.message.means, strict=True):
+                x, y = state[at].tolist()
+                lines.append(f"{sent.message.time},boat {one},{x!r},{y!r}")
+    table.write_text("\n".join(lines))
+    who = '[[requirement]]\nkind = "identity"\nverdict = "none"\nshare_min = 0.5\n[identities]\n"boat 2" = "mmsi:1"\n'
+    profile.write_text(PROFILE + MORE + who)
+    out, page = tmp_path / "scores.json", tmp_path / "report.html"
+    files = ["--truth", str(table), "--json", str(out), "--html", str(page)]
+    assert main(["evaluate", str(flown[0]), "--profile", str(profile), *files]) == 1
+    assert "exact: not kept by target boat " in capsys.readouterr().out
+    assert '<td class="left">boat 1</td>' in page.read_text()
+    (told,) = json.loads(out.read_text())["requirements"]
+    assert told["names"]["2"] == "boat 2"
+    assert set(told["requirements"][-1]["targets"]) == {"2"}
+
+
+def test_each_source_by_the_others_leaves_the_rest_by_the_missions_own_truth(
+    flown: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first tables are of the truth, and nothing says that they are of a reference; the last one is of it."""
+    own, out = str(flown[0]), tmp_path / "scores.json"
+    assert main(["evaluate", own, "--json", str(out)]) == 0
+    by_truth = json.loads(out.read_text())
+    assert main(["evaluate", own, "--reference", "each", "--json", str(out)]) == 0
+    said, told = capsys.readouterr().out, json.loads(out.read_text())
+    assert "scored against a reference" not in said
+    assert "Tracks against the truth:" in said
+    assert (told["rows"], told["reference"]) == (by_truth["rows"], "")
+    assert [one["source"] for one in told["each_source"]] == ["radar1", "radar2", "radar3"]
+    assert all(one["pairs"] > 0 and one["rmse_position"] > 0 for one in told["each_source"])
+    assert main(["evaluate", own, "--reference", "smoothed"]) == 0
+    assert "Tracks against the reference:" in capsys.readouterr().out
+
+
 def test_the_shipped_profiles_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--profile", "list"]) == 0
     said = capsys.readouterr().out

@@ -74,6 +74,8 @@ x = 1
     [
         ({"rule_options": {"colour": 1}}, "auto has no option 'colour' (known: "),
         ({"rule": 7}, "must be one of"),
+        ({"rule": "cii"}, ": did you mean ci?"),
+        ({"rule": "my_rule.py"}, "say which function of it, as in my_rule.py:fuse"),
         ({"frame": {"kind": "ecef"}}, "an ECEF picture needs x, y and z"),
         ({"sources": {"bad name": {}}}, "bad name"),
         ({"sources": 3}, "must be a table of tables"),

@@ -153,6 +153,8 @@ def test_what_is_not_there_is_told(mission: tuple[Path, list[Message]], tmp_path
         export(path, tmp_path / "c.csv", centre="other")
     with pytest.raises(ReviewError, match=r"\.csv, \.parquet, \.geojson or \.kml"):
         export(path, tmp_path / "c.xlsx")
+    with pytest.raises(ReviewError, match="name a file in a folder that exists"):
+        export(path, tmp_path / "nowhere" / "c.csv")
     (tmp_path / "there.csv").write_text("")
     with pytest.raises(FileExistsError, match="exists already"):
         export(path, tmp_path / "there.csv")

@@ -3,7 +3,8 @@
 * All is scored by position, (x, y), and z if the scoring space has it, in the frame of the centre's tracks, at the
   steps of the centre or at every multiple of `every` seconds (UTC), from the first truth to the last.
 * Truth is interpolated linearly. An object exists from its first message to its last, but not inside a gap longer
-  than `gap` seconds and than three of its median intervals.
+  than `gap` seconds and than three of its median intervals. Times in such a gap of all of truth's messages are not
+  scored: who was where then is not known.
 * A source shows the newest version of each track of its newest epoch, unless a later complete scan left the track
   out or it is older than three declared periods; predicted to the time with its declared motion. All it publishes
   counts, whatever the existence probability.

@@ -6,14 +6,16 @@
     x, y, z         instead: m, in the frame of the picture (of ENU: east, north, up)
     vx, vy, vz      m/s along the same axes, all or none; with x, y only
 
-The columns may stand in any order, apart by commas, semicolons or tabs; others are left alone. Where no velocities are
-given each is the slope of a straight line through five fixes, the one in the middle and two on either side (fewer at an
-end and at a gap; of a fix alone there is none): smoothed over four intervals, and so behind in a turn.
+The columns may stand in any order, apart by commas, semicolons or tabs (`csv_text` opens what spreadsheets make of
+that); others are left alone. Of rows that say the same twice one counts. Where no velocities are given each is the
+slope of a straight line through five fixes, the one in the middle and two on either side (fewer at an end and at a gap;
+of a fix alone there is none): smoothed over four intervals, and so behind in a turn.
 """
 
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Floats
 from fusion_service.errors import ReviewError
 from fusion_service.geodesy import FrameError, geodetic_to_ecef, transform
+from fusion_service.review.evaluation.csv_text import Heading, decimal, in_degrees, open_table
 from schemas import Ecef, Frame, Truth
 
 __all__ = ["GpsTable", "is_gps_table", "read_gps"]
@@ -48,9 +51,11 @@ EARLIEST_NS, LATEST_S = 10**16, 10**11
 """Since 1970: fewer ns, or more s, are another unit."""
 SIDE = 2
 """Fixes on either side of the one whose velocity is sought."""
-GAP = 3.0
-"""Median intervals beyond which no line is drawn."""
+GAP, LEAST_GAP = 3.0, 5.0
+"""Median intervals beyond which no line is drawn, and, s, no place is known."""
 
+LONGEST_ID = 200
+EXAMPLE = "2026-01-31T12:00:00Z"
 MIDDLE = "slopes of straight lines through five fixes"
 
 
@@ -134,88 +139,128 @@ def slopes(times: NDArray[np.int64], places: Floats) -> Floats:
 
 
 def is_gps_table(path: Path) -> bool:
-    """Whether a CSV is such a table, and none of tracks (`schemas.flat`)."""
-    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-        names = _columns(file.readline())[1]
-    return "track_id" not in names and not any(name.startswith("cov_") for name in names)
+    """Whether a table in text is such a one, and none of tracks (`schemas.flat`)."""
+    with open_table(path) as (_, heading):
+        return "track_id" not in heading.names and not any(name.startswith("cov_") for name in heading.names)
 
 
 def read_gps(path: Path) -> GpsTable:
-    """Read the CSV `path`. `ReviewError` says what is wrong, in which line."""
-    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
-        delimiter, names = _columns(file.readline())
-        axes, geodetic = _axes(path, names)
+    """Read the table `path`. `ReviewError` says what is wrong, in which line."""
+    with open_table(path) as (file, heading):
+        if not any(heading.names):
+            raise ReviewError(f"{path} is empty: {NEEDED}")
+        heading = heading._replace(names=[OTHER_NAMES.get(name, name) for name in heading.names])
+        axes, geodetic = _axes(path, heading)
         speeds = tuple(f"v{axis}" for axis in axes) if not geodetic else ()
-        given = [name for name in speeds if name in names]
+        given = [name for name in speeds if name in heading.names]
         if given and len(given) < len(speeds):
-            raise ReviewError(f"{path}: line 1: {given[0]} alone: give {', '.join(speeds)}, or none of them")
-        reader = csv.reader(file, delimiter=delimiter)
-        rows = list(_rows(path, reader, names, (*axes, *given), geodetic))
+            raise ReviewError(
+                f"{path}: line {heading.line}: {given[0]} alone: give {', '.join(speeds)}, or none of them"
+            )
+        reader = csv.reader(file, delimiter=heading.delimiter)
+        rows = list(_rows(path, reader, heading, (*axes, *given), geodetic))
     if not rows:
         raise ReviewError(f"{path} holds no fix: {NEEDED}")
-    texts = [row[2] for row in rows]
-    numbers, called = _ids(texts)
-    numbered = np.array([numbers[text] for text in texts], dtype=np.uint64)
+    numbers, called = _ids([row[2] for row in rows])
+    numbered = np.array([numbers[row[2]] for row in rows], dtype=np.uint64)
     times, unit = _times(path, [(row[0], row[1]) for row in rows])
     values = np.array([row[3] for row in rows], dtype=np.float64)
     order = np.lexsort((times, numbered))
-    twice = np.flatnonzero((np.diff(numbered[order]) == 0) & (np.diff(times[order]) == 0))
-    if len(twice):
-        one, two = sorted(rows[order[twice[0] + k]][0] for k in (0, 1))
-        raise ReviewError(f"{path}: line {two}: the same id at the same time as in line {one}: keep one of them")
+    order, repeated = _once(path, order, numbered, times, values, [row[0] for row in rows])
     places = values[:, : len(axes)]
     low = geodetic and len(axes) == 2
     if low:
         places = np.column_stack([places, np.zeros(len(places))])
-    note = f"{len(rows)} fixes of {len(numbers)} objects, time in {unit}; "
+    note = f"{plural(len(order), 'fix', 'fixes')} of {plural(len(numbers), 'object')}, time in {unit}; "
     flat = ", no alt: 0 m above the ellipsoid" if low else ""
     note += f"degrees (WGS84){flat}" if geodetic else "m in the picture's frame"
     note += f"; velocities: {'as given' if given else MIDDLE}"
+    note += f"; {plural(repeated, 'row')} that said the same twice left out" if repeated else ""
+    note += _gaps(times[order], numbered[order])
     velocities = values[order, len(axes) :] if given else None
     return GpsTable(path, geodetic, times[order], numbered[order], places[order], velocities, called, note)
 
 
-def _columns(line: str) -> tuple[str, list[str]]:
-    """What the columns are apart by, and their names."""
-    delimiter = max(",;\t", key=line.count)
-    names = [name.strip().strip('"').lower() for name in line.rstrip("\r\n").split(delimiter)]
-    return delimiter, [OTHER_NAMES.get(name, name) for name in names]
+def plural(count: int, one: str, more: str = "") -> str:
+    """`count` of them, in words."""
+    return f"{count} {one if count == 1 else more or one + 's'}"
 
 
-def _axes(path: Path, names: Sequence[str]) -> tuple[tuple[str, ...], bool]:
+def _once(
+    path: Path,
+    order: NDArray[np.intp],
+    ids: NDArray[np.uint64],
+    times: NDArray[np.int64],
+    values: Floats,
+    lines: Sequence[int],
+) -> tuple[NDArray[np.intp], int]:
+    """`order` (R,), by object and time, without rows that repeat the one before, and how many these were."""
+    same = (np.diff(ids[order]) == 0) & (np.diff(times[order]) == 0)
+    equal = (values[order[1:]] == values[order[:-1]]).all(axis=1)
+    twice = np.flatnonzero(same & ~equal)
+    if len(twice):
+        one, two = sorted(lines[order[twice[0] + k]] for k in (0, 1))
+        raise ReviewError(
+            f"{path}: line {two}: the same id at the same time as in line {one}, elsewhere: keep one of them"
+        )
+    return order[np.append(True, ~same)], int(same.sum())
+
+
+def _gaps(times: NDArray[np.int64], ids: NDArray[np.uint64]) -> str:
+    """Which objects have gaps in which nothing is known of them, in words; empty where none has."""
+    longest = []
+    for one in np.split(times, np.flatnonzero(np.diff(ids)) + 1):
+        steps = np.diff(one) / 1e9
+        wide = steps[steps > max(LEAST_GAP, GAP * float(np.median(steps)))] if len(steps) else steps
+        longest += [float(wide.max())] if len(wide) else []
+    if not longest:
+        return ""
+    have = "has a gap" if len(longest) == 1 else "have gaps"
+    return (
+        f"; {plural(len(longest), 'object')} {have} of up to {max(longest):.4g} s, in which nobody knows where they "
+        "were: their tracks count as false then, unless all have the gap, when nothing is scored"
+    )
+
+
+def _axes(path: Path, heading: Heading) -> tuple[tuple[str, ...], bool]:
     """The columns of the place, and whether it is geodetic."""
+    where, names = f"{path}: line {heading.line}", heading.names
     for name in ("time", "id"):
         if names.count(name) != 1:
             what = "twice" if name in names else f"missing (there are: {', '.join(names)[:200]})"
-            raise ReviewError(f"{path}: line 1: column {name} is {what}: {NEEDED}")
+            raise ReviewError(f"{where}: column {name} is {what}: {NEEDED}")
     for pair, third, geodetic in ((("lat", "lon"), "alt", True), (("x", "y"), "z", False)):
         if all(name in names for name in pair):
             axes = (*pair, third) if third in names else pair
             if doubled := [name for name in axes if names.count(name) > 1]:
-                raise ReviewError(f"{path}: line 1: column {doubled[0]} stands twice")
+                raise ReviewError(f"{where}: column {doubled[0]} stands twice")
             return axes, geodetic
-    raise ReviewError(f"{path}: line 1: no place: {NEEDED} (there are: {', '.join(names)[:200]})")
+    raise ReviewError(f"{where}: no place: {NEEDED} (there are: {', '.join(names)[:200]})")
 
 
 def _rows(
-    path: Path, reader: Iterator[list[str]], names: Sequence[str], wanted: Sequence[str], geodetic: bool
+    path: Path, reader: Iterator[list[str]], heading: Heading, wanted: Sequence[str], geodetic: bool
 ) -> Iterator[tuple[int, str, str, list[float]]]:
     """Line, time, id and numbers of each row; empty lines are passed over."""
+    line, delimiter, names = heading
     at = {name: names.index(name) for name in ("time", "id", *wanted)}
-    line = 1
+    first = line
     try:
         for row in reader:
             line += 1
             if not any(cell.strip() for cell in row):
                 continue
             if len(row) != len(names):
-                raise ReviewError(f"{path}: line {line} has {len(row)} fields, the first line has {len(names)}")
-            values = [_number(path, line, name, row[at[name]]) for name in wanted]
+                raise ReviewError(f"{path}: line {line} has {len(row)} fields, line {first} has {len(names)}")
+            values = [_number(path, line, name, decimal(row[at[name]].strip(), delimiter)) for name in wanted]
             if geodetic:
                 _check_degrees(path, line, values[0], values[1])
             if not (who := row[at["id"]].strip()):
                 raise ReviewError(f"{path}: line {line}: id is empty")
-            yield line, row[at["time"]].strip(), who, values
+            if len(who) > LONGEST_ID or not who.isprintable():
+                what = f"{who[:40]!r}...: it must be text in one line, of {LONGEST_ID} characters at most"
+                raise ReviewError(f"{path}: line {line}: id is {what}")
+            yield line, decimal(row[at["time"]].strip(), delimiter), who, values
     except csv.Error as error:
         raise ReviewError(f"{path}: line {line + 1}: {error}") from None
 
@@ -224,7 +269,10 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
     try:
         value = float(text)
     except ValueError:
-        raise ReviewError(f"{path}: line {line}: {name} is {text[:40]!r}, no number") from None
+        degrees = in_degrees(text[:40]) if name in ("lat", "lon") else None
+        hint = f": write degrees with decimals, as in {degrees:.6f}" if degrees is not None else ""
+        hint = hint if text else ": leave the row out where there is no fix"
+        raise ReviewError(f"{path}: line {line}: {name} is {text[:40]!r}, no number{hint}") from None
     if not np.isfinite(value):
         raise ReviewError(f"{path}: line {line}: {name} is {text[:40]!r}: leave the row out where there is no fix")
     return value
@@ -232,8 +280,13 @@ def _number(path: Path, line: int, name: str, text: str) -> float:
 
 def _check_degrees(path: Path, line: int, lat: float, lon: float) -> None:
     if abs(lat) > 90 or not -180 <= lon <= 360:
-        swapped = ": are lat and lon swapped?" if abs(lat) <= 360 and abs(lon) <= 90 else ""
-        raise ReviewError(f"{path}: line {line}: lat {lat:g}, lon {lon:g} is no place in degrees{swapped}")
+        hint = ": are lat and lon swapped?" if abs(lat) <= 360 and abs(lon) <= 90 else ""
+        if abs(lat) > 360 or abs(lon) > 360:
+            hint = ": metres of a map? Convert them to degrees, WGS84"
+            if abs(lat) % 100 < 60 and abs(lon) % 100 < 60 and abs(lat) < 9060 and abs(lon) < 18060:
+                one, other = (math.copysign(abs(a) // 100 + abs(a) % 100 / 60, a) for a in (lat, lon))
+                hint = f": degrees and minutes in one, as NMEA writes them? Then it is {one:.6f}, {other:.6f}"
+        raise ReviewError(f"{path}: line {line}: lat {lat:.10g}, lon {lon:.10g} is no place in degrees{hint}")
 
 
 def _ids(texts: Sequence[str]) -> tuple[Mapping[str, int], dict[int, str]]:
@@ -248,14 +301,15 @@ def _times(path: Path, rows: Sequence[tuple[int, str]]) -> tuple[NDArray[np.int6
     """Times, ns, of (line, text), and their unit; all of one kind."""
     line, first = rows[0]
     read, unit = _reader(path, line, first)
-    found = []
+    found: list[int] = []
     for line, text in rows:
         try:
             value = read(text)
         except (ValueError, InvalidOperation, OverflowError):
             value = 2**62
         if not (abs(value) < 2**62 and (unit != "ns" or abs(value) >= EARLIEST_NS)):
-            raise ReviewError(f"{path}: line {line}: time is {text[:40]!r}, no time in {unit} as in line {rows[0][0]}")
+            what = f"in {unit} as in line {rows[0][0]}" if found else f"as in {EXAMPLE}, nor s or ns since 1970"
+            raise ReviewError(f"{path}: line {line}: time is {text[:40]!r}, no time {what}")
         found.append(value)
     return np.array(found, dtype=np.int64), unit
 

@@ -7,6 +7,8 @@ whose track on it came furthest:
     merged         that track was part of a confirmed track, which is assigned to another target
     far            that track was part of a confirmed track, which is farther from the target than the cut-off
     unconfirmed    that track was part of a tentative track
+    suspended      that track was in no fused track; its own was suspended, says the step log: its existence had fallen
+                   so low that it was not shown
     gate           that track was in no fused track; the step log says that it failed its gate, or was cut
     refused        the same; messages of its source were refused or dropped in the last three of its periods
     unlinked       the same, and nothing says why
@@ -34,7 +36,7 @@ from schemas.messages import TENTATIVE
 
 __all__ = ["CAUSES", "MERGED", "Coverages", "Misses", "PlatformPath", "Sighting"]
 
-OUTSIDE, UNSEEN, UNLINKED, REFUSED, GATE, UNCONFIRMED, FAR, MERGED, NO_PICTURE = range(1, 10)
+OUTSIDE, UNSEEN, UNLINKED, REFUSED, GATE, SUSPENDED, UNCONFIRMED, FAR, MERGED, NO_PICTURE = range(1, 11)
 
 CAUSES = (
     "",
@@ -43,6 +45,7 @@ CAUSES = (
     "seen, but in no fused track",
     "seen, but its source was refused",
     "seen, but out of the centre's gate",
+    "seen, but the existence of its track was too low",
     "seen, but not confirmed",
     "its track was farther off than the cut-off",
     "merged into the track of another target",
@@ -153,5 +156,7 @@ class Misses:
         epoch, track = sighting.numbers.keys[number]
         if (name, epoch, track) in self._turned_away.outside(picture.time):
             return GATE
+        if self._turned_away.suspended((name, epoch, track), picture.time):
+            return SUSPENDED
         since = time - round(3e9 * sighting.period)
         return REFUSED if self._turned_away.refused(name, since, time) else UNLINKED

@@ -6,11 +6,13 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats
 from fusion_service.errors import ReviewError
 from fusion_service.review.evaluation.hulls import TrueHulls, true_hulls
 from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.evaluation.times_apart import apart_in_time
 from fusion_service.review.snapshots import STALE_PERIODS, STALE_STEPS, Times, truth_path, truth_positions
 from schemas import Frame, Motion, Truth
 
@@ -108,21 +110,37 @@ def scored_truth(
     if every is None and pictures is None:
         raise NothingToScoreError("no global tracks: without a centre, frame, space and every must be given")
     paths = truth_path(truths, reference.frame, reference.axes, reference.speeds)
-    if not paths:
+    if not truths:
         raise NothingToScoreError("no truth to score against")
-    first, last = min(int(known[0]) for known, _ in paths.values()), max(int(known[-1]) for known, _ in paths.values())
+    ends = [known for known, _ in paths.values()] or [np.sort(np.array([truth.time for truth in truths]))]
+    first, last = min(int(known[0]) for known in ends), max(int(known[-1]) for known in ends)
     if every is None:
         assert pictures is not None
         times = pictures[(pictures >= first) & (pictures <= last)]
     else:
         times = _multiples(first, last, every)
     if not len(times):
+        seen = pictures if pictures is not None and len(pictures) else None
+        if seen is not None and not (first <= int(seen[-1]) and int(seen[0]) <= last):
+            when = apart_in_time((first, last), (int(seen[0]), int(seen[-1])))
+            raise NothingToScoreError(f"no time to score, no picture of the centre while there is truth: {when}")
         raise NothingToScoreError(
             "no time to score: no picture of the centre, or no multiple of every, while there is truth"
         )
-    states = np.stack([truth_positions(*path, times, gap) for path in paths.values()], axis=1)
+    times = times[_told(truths, times, gap)]
+    nobody = [np.zeros((len(times), 0, len(reference.axes) + len(reference.speeds)))]
+    found = [truth_positions(*path, times, gap)[:, None] for path in paths.values()]
+    states = np.concatenate(nobody + found, axis=1)
     states[~np.isfinite(states[:, :, : len(reference.axes)]).all(axis=2)] = np.nan
     return ScoredTruth(times, tuple(paths), states, true_hulls(truths, reference.frame, times, tuple(paths)))
+
+
+def _told(truths: Sequence[Truth], times: Times, gap: float) -> NDArray[np.bool_]:
+    """At which times (K,) truth speaks at all: not inside a gap, by the rule for one object, of all its messages, those
+    of no object among them: who was where then nobody knows. All of them, where it never does."""
+    heard = np.unique(np.array([truth.time for truth in truths], dtype=np.int64))
+    speaks = np.isfinite(truth_positions(heard, np.zeros((len(heard), 1)), times, gap)[:, 0])
+    return speaks if speaks.any() else np.ones(len(times), dtype=np.bool_)
 
 
 def all_times(book: Logbook, pictures: Times | None, every: float | None) -> Times:

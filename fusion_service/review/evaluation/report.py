@@ -126,12 +126,8 @@ def _rules(rows: Sequence[ScoredCentre], *, ranked: bool) -> str:
     text = "The best of each column is marked (ANEES: nearest to 1). GOSPA, OSPA, RMSE in m; 2+: targets that several"
     marked = f"{text} sources track." if ranked else "Not ranked: each row is of a mission of its own."
     note = f'<p class="note">{marked} A rank is of this mission; what a rule promises holds in all.</p>'
-    said = promises(rows)
-    lines = [[*line, said[row.rule]] for line, row in zip(lines, rows, strict=True)]
-    return (
-        html_table([*head, "promise"], lines, marks, left=len(head) - NUMBERS, columns=[len(head)], wide=len(head))
-        + note
-    )
+    said = "".join(f"<dt>{escape(rule)}</dt><dd>{escape(text)}</dd>" for rule, text in promises(rows).items())
+    return html_table(head, lines, marks, left=len(head) - NUMBERS) + note + f'<dl class="facts">{said}</dl>'
 
 
 def _map(one: Assessment) -> list[str]:

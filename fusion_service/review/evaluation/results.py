@@ -151,8 +151,9 @@ def facts(assessment: Assessment) -> dict[str, str]:
     return found
 
 
-def text(assessments: Sequence[Assessment]) -> str:
-    """The plain summary: first in words, then tables; of several centres of a recording the tables of the first."""
+def text(assessments: Sequence[Assessment], against: str = "the truth") -> str:
+    """The plain summary: first in words, then tables; of several centres of a recording the tables of the first.
+    against: what they are scored by."""
     rows, lines = rows_of(assessments), []
     lines += lead(assessments)
     lines += [
@@ -174,7 +175,7 @@ def text(assessments: Sequence[Assessment]) -> str:
             evaluation = one.evaluations[centre]
             if len(one.evaluations) > 1:
                 lines.append(f"of {centre} (--centre NAME shows another, --html and --json all of them):")
-            lines += ["Tracks against the truth:"]
+            lines += [f"Tracks against {against}:"]
             scored = {**evaluation.sources, **({"fused": evaluation.fused} if evaluation.centre else {})}
             lines += [format_table(evaluation), ""]
             lines += [*hull, ""] if (hull := hull_lines(scored)) else []

@@ -63,7 +63,7 @@ def format_table(evaluation: Evaluation) -> str:
         anees = [fixed(row["fused_anees"]), fixed(row["best_anees"]), fixed(*row["nees_bounds"])]
         table.append([name.replace("_", " "), str(row["pairs"]), *rmse, *anees, str(row["fused_missed"])])
     title = "Targets that several sources track: fused beside the best single source, on the same pairs (target, time)"
-    return "\n".join([*lines, "", title, *aligned(table)] if evaluation.seen.max() > 1 else lines)
+    return "\n".join([*lines, "", title, *aligned(table)] if evaluation.seen.max(initial=0) > 1 else lines)
 
 
 def digits(value: float) -> str:
@@ -112,6 +112,8 @@ def sentence(row: ScoredCentre) -> str:
         if np.isfinite(one.rmse_position):
             text += [f"RMSE {metres(one.rmse_position)}", consistent(one.anees, one.bounds)]
         return "; ".join(text) + "."
+    if not evaluation.targets:
+        return f"Truth tells of no target; fused tracks ({row.rule}) were shown {int(fused.series.shown.sum())} times."
     shared = evaluation.shared["seen_by_2_or_more"]
     text = [f"Fused tracks ({row.rule}) followed {fused.followed} of {len(evaluation.targets)} targets"]
     if np.isfinite(fused.rmse_position):

@@ -13,6 +13,7 @@ import numpy as np
 
 from fusion_service.errors import ReviewError
 from fusion_service.extras import install_hint
+from fusion_service.review.evaluation.csv_text import SUFFIXES, is_text_table
 from fusion_service.review.evaluation.gps_table import GpsTable, is_gps_table, read_gps
 from fusion_service.review.evaluation.logbook import Logbook
 from schemas import MessageError, Truth, decode
@@ -58,17 +59,17 @@ NO_TRUTH = TruthFile()
 def read_truth(path: Path) -> TruthFile:
     """Its truth messages; of a table one for each run of rows of one time. Raises `ReviewError` for a file that has
     none or is not as it must be, FileNotFoundError, and what `recording.read` raises."""
-    if path.suffix == ".csv" and path.is_file() and is_gps_table(path):
+    if is_text_table(path) and is_gps_table(path):
         return TruthFile(path, table=read_gps(path))
     return TruthFile(path, told=tuple(_read(path)))
 
 
 def _read(path: Path) -> list[Truth]:
-    if not path.exists() or (path.is_dir() and path.suffix in (".csv", ".parquet")):
+    if not path.exists() or (path.is_dir() and path.suffix.lower() in (*SUFFIXES, ".parquet")):
         raise FileNotFoundError(f"no truth at {path}")
-    if path.suffix == ".csv":
+    if path.suffix.lower() in SUFFIXES:
         found = [truth for table in _csv(path) for truth in _messages(table, path)]
-    elif path.suffix == ".parquet":
+    elif path.suffix.lower() == ".parquet":
         found = [truth for table in _parquet(path) for truth in _messages(table, path)]
     else:
         found = list(_recorded(path))

@@ -1,4 +1,5 @@
-"""What a centre's step logs say that it did not take: local tracks outside their gate, messages it refused."""
+"""What a centre's step logs say that it did not take, or not show: local tracks outside their gate, messages it
+refused, tracks it suspended."""
 
 from __future__ import annotations
 
@@ -6,7 +7,7 @@ from bisect import bisect_left, bisect_right
 
 import numpy as np
 
-from schemas import StepLog
+from schemas import Decisions, StepLog
 from schemas.messages import BROKEN, GATE_FAILED
 
 __all__ = ["TurnedAway"]
@@ -14,6 +15,7 @@ __all__ = ["TurnedAway"]
 MOST = 500_000
 """Rows that are remembered of each kind."""
 
+END = 2**63
 LocalTrack = tuple[str, int, int]
 """Source, epoch and id."""
 
@@ -26,6 +28,9 @@ class TurnedAway:
         self._rows = 0
         self._refused: dict[str, list[tuple[int, str]]] = {}
         self._sorted: set[str] = set()
+        self._suspended: dict[LocalTrack, list[list[int]]] = {}
+        self._behind: dict[int, list[LocalTrack]] = {}
+        self._before: tuple[Decisions, tuple[str, ...]] | None = None
 
     def log(self, message: StepLog) -> None:
         """Enter a step log."""
@@ -42,6 +47,33 @@ class TurnedAway:
                 self._rows += 1
                 self._refused.setdefault(entry.source, []).append((message.time, entry.reason))
                 self._sorted.discard(entry.source)
+        for event in message.events:
+            if event.get("kind") in ("suspended", "resumed") and isinstance(
+                tracks := event.get("tracks"), list | tuple
+            ):
+                for track in (one for one in tracks if isinstance(one, int) and 0 <= one < 2**64):
+                    self._shown(track, message, event["kind"] == "resumed")
+        self._before = made, message.sources
+
+    def _shown(self, track: int, message: StepLog, again: bool) -> None:
+        """A global track is suspended, or shown again: so are the local tracks that were linked to it last."""
+        for one in self._behind.pop(track, []):
+            self._suspended[one][-1][1] = message.time
+        if again or self._rows >= MOST:
+            return
+        members: set[LocalTrack] = set()
+        for made, sources in filter(None, (self._before, (message.decisions, message.sources))):
+            rows = np.flatnonzero(made.track == track).tolist()
+            some = [(int(made.source[row]), int(made.epoch[row]), int(made.id[row])) for row in rows]
+            members |= {(sources[source], epoch, one) for source, epoch, one in some if source < len(sources)}
+        self._rows += len(members)
+        self._behind[track] = sorted(members)
+        for member in self._behind[track]:
+            self._suspended.setdefault(member, []).append([message.time, END])
+
+    def suspended(self, local: LocalTrack, time: int) -> bool:
+        """Whether the track that this one fed was suspended at `time`, ns."""
+        return any(begin <= time < end for begin, end in self._suspended.get(local, ()))
 
     def outside(self, time: int) -> set[LocalTrack]:
         """The local tracks that were outside their gate, or cut, in the step at `time`, ns."""

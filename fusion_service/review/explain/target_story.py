@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from typing import NamedTuple
 
 import numpy as np
@@ -153,5 +154,7 @@ def _summary(assessment: Assessment, record: TargetRecord, start: int) -> str:
         said.append(f"Without a track for {record.missed:.1f} s: {', '.join(parts)}.")
     if record.tracks:
         asked = assessment.book.labels(record.tracks[-1])
-        said.append(f"Of its last track: fusion-service explain {assessment.book.path} --track {asked}")
+        said.append(
+            f"Of its last track: fusion-service explain {shlex.quote(str(assessment.book.path))} --track {asked}"
+        )
     return " ".join(said)

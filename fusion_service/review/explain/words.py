@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
@@ -58,7 +59,7 @@ def listing(mission: RecordedMission, *, everything: bool = False) -> str:
     left = len(lives) - len(shown)
     never = f"; {left} more were never confirmed (--all lists them)" if left else ""
     count = f"{len(shown)} track{'s' * (len(shown) != 1)}"
-    tail = f"{count}{never}. Ask for one: fusion-service explain {mission.path} --track NUMBER"
+    tail = f"{count}{never}. Ask for one: fusion-service explain {shlex.quote(str(mission.path))} --track NUMBER"
     return "\n".join([head, *_table(rows, left=(0, 5, 6)), *_ways(mission), tail])
 
 

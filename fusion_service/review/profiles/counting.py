@@ -107,14 +107,16 @@ def _update_interval(scene: Scene, need: Mapping[str, Any]) -> Counted:
 
 def _gap(scene: Scene, need: Mapping[str, Any]) -> Counted:
     """Of a silence d longer than the limit, from the begin of the stay and to its end too, ceil(d / interval) - 1
-    expected updates are missing; of a stay of length D floor(D / interval) are expected."""
+    expected updates are missing; of a stay of length D floor(D / interval) are expected, and all of them missing where
+    there was no update at all."""
     missing, total = np.zeros((2, len(scene.seen.targets)))
     length = need["interval_s"]
     for t, begin, end, at in _updates(scene, need["counts"]):
         expected = int((end - begin + EDGE) // length)
         silent = np.diff(np.concatenate([[begin], at, [end]]))
         silent = silent[silent > need["longer_than_s"] + EDGE]
-        missing[t] += min(float(np.maximum(np.ceil((silent - EDGE) / length) - 1, 1).sum()), expected)
+        lacking = float(np.maximum(np.ceil((silent - EDGE) / length) - 1, 1).sum())
+        missing[t] += min(lacking, expected) if len(at) or not len(silent) else expected
         total[t] += expected
     return Counted(missing, total, "share", why="no target stayed for one expected interval")
 
@@ -159,9 +161,11 @@ def _velocity_error(scene: Scene, need: Mapping[str, Any]) -> Counted:
 
 
 def _false_tracks(scene: Scene, need: Mapping[str, Any]) -> Counted:
-    far = scene.seen.rest.apart > (need["farther_than_m"] or scene.seen.c)
+    """Those with a target of their own too: where the cut-off is larger than what counts as far."""
+    least = need["farther_than_m"] or scene.seen.c
+    far = (scene.seen.rest.apart > least)[scene.rest].sum() + (scene.seen.pairs.apart > least)[scene.shown].sum()
     shown = float(scene.rest.sum() + scene.shown.sum())
-    return Counted(np.array([float((far & scene.rest).sum())]), np.array([shown]), "share", False, "no track was shown")
+    return Counted(np.array([float(far)]), np.array([shown]), "share", False, "no track was shown")
 
 
 def _multiple_tracks(scene: Scene, need: Mapping[str, Any]) -> Counted:

@@ -9,8 +9,9 @@ not shown   it does, but on so few samples that a worse one is not excluded; or 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -71,8 +72,11 @@ class Judged:
         }
 
 
-def judge(profile: Profile, seen: Observed) -> list[Judged]:
-    """All requirements of a profile, in its order. ReviewError for an area that has no meaning in this mission."""
+def judge(profile: Profile, seen: Observed, names: Mapping[int, str] = MappingProxyType({})) -> list[Judged]:
+    """All requirements of a profile, in its order; names: of targets that have some. ReviewError for an area that has
+    no meaning in this mission."""
+    called = {one: profile.identities.get(one, profile.identities.get(names.get(one, ""))) for one in seen.targets}
+    identities = {one: identity for one, identity in called.items() if identity}
     areas = {area.name: area for area in profile.areas}
     scenes: dict[str, Scene] = {}
     found = []
@@ -84,7 +88,7 @@ def judge(profile: Profile, seen: Observed) -> list[Judged]:
                 targets_inside(area, seen),
                 rest_inside(area, seen, seen.rest.place),
                 rest_inside(area, seen, seen.pairs.place),
-                profile.identities,
+                identities,
             )
         counted = COUNTING[one.kind](scenes[one.area], one.numbers)
         whole = _verdict(one, counted, float(counted.sums.sum()), float(counted.samples.sum()))

@@ -35,7 +35,8 @@ BLOCK = 32
 class Pairs:
     """R tracks at a scored time k with a target t: number of the track, offset (R, 3) east, north, up from the target,
     m (up NaN on the plane), velocity (R, 2) and its error (R, 2), m/s, identity (R,) as an index of
-    `Observed.identities`, -1 for none, updated (R,) ns: the last measurement, and place (R, d) in the frame."""
+    `Observed.identities`, -1 for none, updated (R,) ns: the last measurement, place (R, d) in the frame, and apart
+    (R,), m: to the nearest target, which may be another one."""
 
     k: Ints
     t: Ints
@@ -46,6 +47,7 @@ class Pairs:
     identity: Ints
     updated: Times
     place: Floats
+    apart: Floats
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,7 +205,7 @@ class _Walk:
         speed = self._level(place, states[rows, d:])[:, :2]
         error = self._level(place, offset[:, d:])[:, :2]
         self._pairs.append(
-            (np.full(len(rows), k), targets, number[rows], level, speed, error, identity, updated, place)
+            (np.full(len(rows), k), targets, number[rows], level, speed, error, identity, updated, place, nearest[rows])
         )
         left = np.setdiff1d(np.arange(len(states)), rows)
         self._rest.append((np.full(len(left), k), states[left, :d], nearest[left]))
@@ -244,7 +246,7 @@ class _Walk:
         known = self._exists.reshape(-1)
         velocity = np.full((count * targets, 2), np.nan)
         velocity[known] = self._level(flat[known], self._velocity.reshape(-1, d)[known])[:, :2]
-        pairs = [np.concatenate([one[i] for one in self._pairs]) for i in range(9)]
+        pairs = [np.concatenate([one[i] for one in self._pairs]) for i in range(10)]
         rest = [np.concatenate([one[i] for one in self._rest]) for i in range(3)]
         return Observed(
             centre=self._centre,
@@ -267,7 +269,7 @@ class _Walk:
         """(K T,): where the frame has none, by truth's own z."""
         frame, found = self._reference.frame, np.full(len(flat), np.nan)
         place = flat
-        if self._d == 2:
+        if self._d == 2 and len(self._scored.targets):
             paths = truth_path(truths, frame, self._reference.axes, ("z",))
             moved = [truth_positions(*paths[one], self._scored.times, np.inf) for one in self._scored.targets]
             place = np.stack(moved, axis=1).reshape(-1, 3)

@@ -52,7 +52,7 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """cutoff: m, None where it leaves it to the evaluation; identities: of truth ids."""
+    """cutoff: m, None where it leaves it to the evaluation; identities: of true objects, by id or by name."""
 
     name: str
     source: str
@@ -60,7 +60,7 @@ class Profile:
     cutoff: float | None = None
     areas: tuple[Area, ...] = ()
     requirements: tuple[Requirement, ...] = ()
-    identities: Mapping[int, str] = field(default_factory=dict)
+    identities: Mapping[int | str, str] = field(default_factory=dict)
     path: str = ""
 
 

@@ -3,7 +3,7 @@
 [profile]        name, source; note, cutoff_m
 [[area]]         name; polygon_lat_lon_deg or polygon_x_y_m, disk_lat_lon_deg or disk_x_y_m with radius_m, height_m
 [[requirement]]  kind, the keys of its kind; name, area, source, unverified, confidence, each_target
-[identities]     what truth ids are called, for kind identity: 17 = "mmsi:257000000"
+[identities]     what true objects are called, for kind identity, by id or by name: 17 = "mmsi:257000000"
 """
 
 from __future__ import annotations
@@ -158,18 +158,16 @@ def _list(raw: Mapping[str, Any], name: str, problems: Problems) -> list[Any]:
     return []
 
 
-def _identities(table: Any, problems: Problems) -> dict[int, str]:
-    found: dict[int, str] = {}
+def _identities(table: Any, problems: Problems) -> dict[int | str, str]:
+    found: dict[int | str, str] = {}
     if not isinstance(table, Mapping):
         problems.append((("identities",), f"is {table!r}, must be a table"))
         return found
     for key, value in table.items():
-        if not re.fullmatch(r"\d{1,20}", key):
-            problems.append((("identities", key), "is no id of a target: a whole number"))
-        elif not isinstance(value, str) or not value:
+        if not isinstance(value, str) or not value:
             problems.append((("identities", key), f"is {value!r}, must be an identity, as in 'mmsi:257000000'"))
         else:
-            found[int(key)] = value
+            found[int(key) if re.fullmatch(r"\d{1,20}", key) else key] = value
     return found
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from fusion_service.review.evaluation.tables import aligned
@@ -22,7 +23,7 @@ MARKS = {PASSED: "good", FAILED: "high", NOT_SHOWN: "low"}
 
 
 class Told(NamedTuple):
-    """One recording's centre under a profile. reference: what it was judged by, in words."""
+    """One recording's centre under a profile. reference: what it was judged by, in words; names: of targets, by id."""
 
     profile: Profile
     recording: str
@@ -30,6 +31,7 @@ class Told(NamedTuple):
     cutoff: float
     reference: str
     judged: list[Judged]
+    names: Mapping[int, str] = MappingProxyType({})
 
 
 def asked(one: Requirement) -> str:
@@ -94,20 +96,23 @@ def text(told: Sequence[Told]) -> str:
         ]  # fmt: skip
         lines += aligned([head, *table], left=3)
         for one in each.judged:
-            lines += _remarks(one)
+            lines += _remarks(one, each.names)
         if each.profile.note:
             lines.append(f"note: {each.profile.note}")
     return "\n".join([*lines, "", summary(told)])
 
 
-def _remarks(one: Judged) -> list[str]:
+def _remarks(one: Judged, names: Mapping[int, str]) -> list[str]:
     lines = []
     if one.whole.words and (one.verdict == NOT_SHOWN or not one.whole.samples):
         lines.append(f"  {one.requirement.name}: {one.whole.words}")
     bad = {target: verdict for target, verdict in one.targets.items() if verdict.verdict == FAILED}
     if bad and (one.verdict == FAILED or one.requirement.each_target):
         worst_first = sorted(bad, key=lambda target: bad[target].found, reverse="share_min" not in _asked(one))
-        named = [f"{target} ({found(one.requirement, bad[target])})" for target in worst_first[:MOST_TARGETS]]
+        named = [
+            f"{names.get(target, target)} ({found(one.requirement, bad[target])})"
+            for target in worst_first[:MOST_TARGETS]
+        ]
         more = f" and {len(bad) - MOST_TARGETS} more" if len(bad) > MOST_TARGETS else ""
         lines.append(f"  {one.requirement.name}: not kept by target {', '.join(named)}{more}")
     if one.requirement.unverified:
@@ -131,6 +136,7 @@ def as_json(told: Sequence[Told]) -> list[dict[str, Any]]:
             "cutoff": each.cutoff,
             "reference": each.reference,
             "verdict": worst(each.judged),
+            "names": {str(target): name for target, name in each.names.items()},
             "requirements": [
                 {**one.as_json(), "asked": asked(one.requirement), "counted": KINDS[one.requirement.kind].words}
                 for one in each.judged
@@ -140,9 +146,10 @@ def as_json(told: Sequence[Told]) -> list[dict[str, Any]]:
     ]
 
 
-def against(reference: str) -> list[str]:
-    """The page's word of what all is scored against, where it is not the recording's own truth."""
-    return [f'<p class="lead">Scored against {escape(reference)}.</p>'] if reference else []
+def against(reference: str, odd: Sequence[str] = ()) -> list[str]:
+    """The page's word of what all is scored against, where it is not the recording's own truth; odd: of that truth."""
+    said = [f"Scored against {reference}.", *odd] if reference else []
+    return [f'<p class="lead">{escape(one)}</p>' for one in said]
 
 
 def page(told: Sequence[Told]) -> list[str]:
@@ -154,15 +161,16 @@ def page(told: Sequence[Told]) -> list[str]:
             f"; against {each.reference}" if each.reference else ""
         )
         body.append(f'<p class="lead">{escape(about)}.</p>')
-        head = ("requirement", "area", "asked", "found", "samples", "how sure", "verdict")
+        head = ("requirement", "verdict", "area", "asked", "found", "samples", "how sure")
         rows, sources = [], []
         for one in each.judged:
             need = one.requirement
             source = need.source + (f" (not verified: {need.unverified})" if need.unverified else "")
-            cells = [need.name, need.area, asked(need), found(need, one.whole), _samples(one.whole, need)]
+            cells = [need.area, asked(need), found(need, one.whole), _samples(one.whole, need)]
             marked = f'<td class="{MARKS[one.verdict]}">{one.verdict}</td>'
             sure = f'<td class="left" style="white-space:normal;min-width:14em">{escape(one.whole.words)}</td>'
-            rows.append("".join(f'<td class="left">{escape(cell)}</td>' for cell in cells) + sure + marked)
+            plain = "".join(f'<td class="left">{escape(cell)}</td>' for cell in cells)
+            rows.append(f'<td class="left">{escape(need.name)}</td>{marked}{plain}{sure}')
             sources.append(f"<dt>{escape(need.name)}</dt><dd>{escape(source)}</dd>" if source else "")
         body.append(_table([f'<th class="left">{cell}</th>' for cell in head], rows))
         body.append(f'<dl class="facts">{"".join(sources)}</dl>')
@@ -177,7 +185,7 @@ def page(told: Sequence[Told]) -> list[str]:
 
 
 def _by_target(each: Told) -> list[str]:
-    targets = sorted({target for one in each.judged for target in one.targets})
+    names, targets = each.names, sorted({target for one in each.judged for target in one.targets})
     if not targets:
         return []
     head = [
@@ -186,7 +194,7 @@ def _by_target(each: Told) -> list[str]:
     ]
     rows = []
     for target in targets[:MOST_COLUMNS]:
-        cells = [f'<td class="left">{target}</td>']
+        cells = [f'<td class="left">{escape(names.get(target, str(target)))}</td>']
         for one in each.judged:
             if not one.targets:
                 continue

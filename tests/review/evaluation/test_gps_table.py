@@ -111,7 +111,7 @@ HEAD = "time,id,lat,lon\n"
         ("time,id,x,y,vx\n", "line 1: vx alone: give vx, vy"),
         ("time,id,lat,lat,lon\n", "line 1: column lat stands twice"),
         (HEAD, "holds no fix"),
-        (HEAD + "1,a,10,20\n2,a,10\n", "line 3 has 3 fields, the first line has 4"),
+        (HEAD + "1,a,10,20\n2,a,10\n", "line 3 has 3 fields, line 1 has 4"),
         (HEAD + "1,a,10,20\n\n2,a,north,20\n", "line 4: lat is 'north', no number"),
         (HEAD + "1,a,nan,20\n", "line 2: lat is 'nan': leave the row out"),
         (HEAD + "1,a,120,20\n", "line 2: lat 120, lon 20 is no place in degrees: are lat and lon swapped"),
@@ -119,7 +119,7 @@ HEAD = "time,id,lat,lon\n"
         (HEAD + "1700000000000,a,10,20\n", "line 2: time is '1700000000000': that looks like ms"),
         (HEAD + "1700000000,a,10,20\n1700000001000000000,a,10,20\n", "line 3: .*no time in s as in line 2"),
         (HEAD + "2026-01-31T12:00:00Z,a,10,20\nnoon,a,10,20\n", "line 3: time is 'noon', no time in ISO 8601"),
-        (HEAD + "noon,a,10,20\n", "line 2: time is 'noon', no time in ISO 8601"),
+        (HEAD + "noon,a,10,20\n", "line 2: time is 'noon', no time as in 2026"),
         (HEAD + "1,a,10,20\n2,a,10,20\n1,a,11,20\n", "line 4: the same id at the same time as in line 2"),
     ],
 )
@@ -133,3 +133,72 @@ def test_degrees_do_not_go_with_a_frame_that_is_nowhere(tmp_path: Path) -> None:
     path = written(tmp_path / "gps.csv", HEAD + "1,a,10,20\n")
     with pytest.raises(ReviewError, match="do not go with this mission"):
         told(path, Local("dock"))
+
+
+ROWS = (("1", "59.5", "10.25"), ("2", "59.75", "10.5"))
+
+
+def in_text(heading: str, row: str) -> str:
+    """Two objects, two fixes each, in rows of a form with the fields t, i, a and o."""
+    times = ("2026-01-31T12:00:00Z", "2026-01-31T12:00:01Z")
+    lines = [row.format(t=time, i=who, a=lat, o=lon) for time in times for who, lat, lon in ROWS]
+    return "\n".join([heading, *lines, ""])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "encoding"),
+    [
+        ("excel.csv", in_text("time,id,lat,lon", "{t},{i},{a},{o}"), "utf-8-sig"),
+        ("unicode.txt", in_text("time\tid\tlat\tlon", "{t}\t{i}\t{a}\t{o}"), "utf-16"),
+        ("said.CSV", "sep=;\n" + in_text("time;id;lat;lon", "{t};{i};{a};{o}"), "utf-8"),
+        ("logger.tsv", "# logger 2\n\n" + in_text("time\tid\tlat\tlon", "{t}\t{i}\t{a}\t{o}"), "utf-8"),
+        ("units.csv", in_text("Time (UTC),id,Latitude [°],lon (deg)", "{t},{i},{a},{o}"), "utf-8"),
+    ],
+)
+def test_what_spreadsheets_and_loggers_write_is_read(tmp_path: Path, name: str, text: str, encoding: str) -> None:
+    path = tmp_path / name
+    path.write_text(text, encoding=encoding)
+    table = read_truth(path).table
+    assert table is not None
+    assert table.places[:, :2].tolist() == [[59.5, 10.25], [59.5, 10.25], [59.75, 10.5], [59.75, 10.5]]
+
+
+def test_a_comma_is_the_point_where_columns_are_apart_by_semicolons(tmp_path: Path) -> None:
+    text = in_text("time;id;lat;lon", "{t};{i};{a};{o}").replace(".", ",")
+    assert read_gps(written(tmp_path / "a.csv", text)).places[:, 1].tolist() == [10.25, 10.25, 10.5, 10.5]
+
+
+def test_a_row_twice_counts_once_and_another_place_at_one_time_is_refused(tmp_path: Path) -> None:
+    text = in_text("time,id,lat,lon", "{t},{i},{a},{o}")
+    table = read_gps(written(tmp_path / "a.csv", text + text.splitlines()[1] + "\n"))
+    assert len(table.times) == 4
+    assert "4 fixes of 2 objects" in table.note
+    assert "1 row that said the same twice left out" in table.note
+    other = text.splitlines()[1].replace("59.5", "59.6") + "\n"
+    with pytest.raises(ReviewError, match="line 6: the same id at the same time as in line 2, elsewhere"):
+        read_gps(written(tmp_path / "b.csv", text + other))
+
+
+@pytest.mark.parametrize(
+    ("row", "said"),
+    [
+        ("{t},{i},59°30.0'N,10°15'0\"W", r"lat is .*write degrees with decimals, as in 59\.500000"),
+        ("{t},{i},59.5 S,10.25 E", r"as in -59\.500000"),
+        ("{t},{i},5930.000,1015.0", r"as NMEA writes them\? Then it is 59\.500000, 10\.250000"),
+        ("{t},{i},6600000.0,262000.0", "metres of a map"),
+        ("{t},{i},,", "leave the row out where there is no fix"),
+        ("31/01/2026 12:00,{i},{a},{o}", "no time as in 2026-01-31T12:00:00Z, nor s or ns since 1970"),
+        ("{t}," + "n" * 201 + "{i},{a},{o}", "of 200 characters at most"),
+        ("{t},\x1b[2J{i},{a},{o}", "text in one line"),
+    ],
+)
+def test_what_is_clumsy_is_said_with_how_to_mend_it(tmp_path: Path, row: str, said: str) -> None:
+    with pytest.raises(ReviewError, match=said) as raised:
+        read_gps(written(tmp_path / "a.csv", in_text("time,id,lat,lon", row)))
+    assert "line 2: " in str(raised.value)
+
+
+def test_gaps_are_told(tmp_path: Path) -> None:
+    lines = [f"{second},1,{second},0" for second in (*range(10), *range(40, 50))]
+    note = read_gps(written(tmp_path / "a.csv", "\n".join(["time,id,x,y", *lines]))).note
+    assert "1 object has a gap of up to 31 s" in note

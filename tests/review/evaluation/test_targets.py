@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +16,8 @@ from fusion_service.review.evaluation.results import results, text
 from fusion_service.review.evaluation.target_words import why
 from fusion_service.review.evaluation.targets import TargetRecord
 from schemas import Disk, Message, Platform
-from tests.helpers.missed import BIG, SECONDS, mission
+from schemas.messages import KEPT
+from tests.helpers.missed import BIG, SECONDS, logged, mission
 from tests.helpers.missions import START, info, picture, tracks, truth
 
 
@@ -81,7 +83,7 @@ def test_it_is_told_in_words_json_and_on_the_page() -> None:
     (row,) = results([one])["rows"]
     told = {each["target"]: each for each in row["more"]["targets"]}
     assert told["9"]["tracks"] == [str(BIG + 90), str(BIG + 95)]
-    assert told["6"]["missed_because"] == {CAUSES[8]: 6.0}
+    assert told["6"]["missed_because"] == {CAUSES[9]: 6.0}
     assert told["6"]["gaps"][0]["merged_into_tracks_of"] == ["5"]
     json.dumps(row, allow_nan=False)
     page = report([one])
@@ -100,6 +102,27 @@ def test_gaps_of_truth_end_a_gap_and_no_time_is_counted_twice() -> None:
     assert (found.life, found.followed, found.times) == (4.0 + 5.0, 1.0 + 5.0, 11)
     assert [(gap.begin - START, gap.end - START) for gap in found.gaps] == [(0, 2 * 10**9), (3 * 10**9, 4 * 10**9)]
     assert [(gap.begun, gap.ended) for gap in found.gaps] == [(True, False), (False, True)]
+
+
+def test_a_track_that_was_suspended_is_told_as_the_cause() -> None:
+    """From 5 to 8 s the centre does not show the track (lost from 4 to 9), whose existence is too low; a has the target
+    all the time, by a track that is said to have fed it in the step before, and b not."""
+    said: list[Message] = [info("a"), info("b")]
+    for second in range(SECONDS + 1):
+        hidden = 5 <= second < 9
+        event = {5: "suspended", 9: "resumed"}.get(second)
+        log = replace(
+            logged(second),
+            refused=(),
+            events=({"kind": event, "tracks": [BIG + 70, "x", -1]},) if event else (),
+            decisions=replace(logged(10).decisions, kind=np.full(1, KEPT, dtype=np.uint8)),
+        )
+        said += [truth(second, [1], [[0.0, 0.0]]), tracks("a", second, [7], [[0.0, 0.0]]), log]
+        said.append(picture(second, [] if hidden else [BIG + 70], [] if hidden else [[0.0, 0.0]]))
+    found = record(assess(Logbook(said), c=50.0).evaluations["centre"], 1)
+    assert {CAUSES[code]: seconds for code, seconds in found.causes} == {
+        "seen, but the existence of its track was too low": 5.0
+    }
 
 
 def test_what_a_source_covers_goes_along_with_its_platform() -> None:

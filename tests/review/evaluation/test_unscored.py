@@ -42,7 +42,6 @@ def test_without_a_centre() -> None:
     ("mission", "says"),
     [
         ([picture(0, [1], STILL)], "no truth"),
-        ([truth(0, [], []), picture(0, [1], STILL)], "no truth"),
         ([truth(0, [1], STILL)], "frame, space and every must be given"),
         ([truth(0, [1], STILL), picture(5, [1], STILL)], "no time to score"),
         ([truth(0, [1], STILL), picture(0, [1], STILL), picture(0, [1], STILL, centre="b")], "several centres"),

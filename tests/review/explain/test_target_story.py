@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import pytest
@@ -26,7 +27,7 @@ def key(message: Message) -> str:
 @pytest.fixture(scope="module")
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Recorded with a cut-off of 50 m."""
-    path = tmp_path_factory.mktemp("target") / "mission.rrd"
+    path = tmp_path_factory.mktemp("target") / "my mission.rrd"
     with Recorder(path, draw=False, cutoff=50.0) as recorder:
         for message in mission():
             recorder.handle(key(message), schemas.encode(message), START)
@@ -44,6 +45,8 @@ def test_who_saw_it_and_which_tracks_followed_it_is_told(flown: Path, capsys: py
     assert spans["followed by track 90, RMSE 0 m"] == "0.0-6.0"
     assert spans["followed by track 95, RMSE 0 m"] == f"14.0-{SECONDS:.1f}"
     assert spans["no fused track: lost from 6.0 to 14.0: seen by none"] == "6.0-14.0"
+    words = shlex.split(next(line for line in out.splitlines() if "fusion-service explain" in line))
+    assert words[words.index("explain") + 1] == str(flown)
     assert "It was lost once, and found again once. Without a track for 8.0 s: seen by none 8.0 s." in out
 
 

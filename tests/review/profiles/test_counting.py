@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from fusion_service.errors import ReviewError
+from fusion_service.review.evaluation.assess import assess
 from fusion_service.review.evaluation.logbook import Logbook
+from fusion_service.review.evaluation.results import text
 from fusion_service.review.profiles import Area, Judged, Profile, Requirement, judge
 from fusion_service.review.profiles.observing import Observed, observe
 from fusion_service.review.profiles.profile import KINDS
@@ -71,11 +73,11 @@ def test_updates_are_new_measurements_and_intervals_are_cut_from_the_stay() -> N
 
 
 def test_a_gap_may_be_at_the_end_and_a_target_that_is_never_seen_lacks_all() -> None:
-    """Of 10 expected updates 4 s of silence at the end lack 3; of a target without any track 9."""
+    """Of 10 expected updates 4 s of silence at the end lack 3; of a target without any track all 10."""
     silent = one(lone(10, range(7)), need("gap", longer_than_s=3.0, interval_s=1.0, share_max=0.5))
     assert (silent.whole.found, silent.whole.samples) == (3 / 10, 10)
     never = one(lone(10, []), need("gap", longer_than_s=3.0, interval_s=1.0, share_max=1.0))
-    assert never.whole.found == 9 / 10
+    assert never.whole.found == 1.0
 
 
 def test_errors_are_split_along_and_across_the_true_velocity() -> None:
@@ -257,3 +259,32 @@ def test_a_crowd_counts_as_a_few_do() -> None:
     assert one(mission, need("false_tracks", share_max=0.5)).whole.found == 10 / 60
     assert one(mission, need("false_tracks", share_max=0.5, farther_than_m=5001.0)).whole.found == 0.0
     assert one(mission, need("position_error", rms_max_m=9.0)).whole.found == pytest.approx(6.0)
+
+
+def test_a_track_with_a_target_is_false_too_where_it_is_farther_than_that() -> None:
+    """With a cut-off of 100 m the track 80 m off has the target, and is farther than 60 m from every one."""
+    mission: list[Message] = [truth(t, [1], [[0.0, 0.0]]) for t in range(4)]
+    mission += [picture(t, [5], [[80.0 if t < 1 else 3.0, 0.0]]) for t in range(4)]
+    found = one(mission, need("false_tracks", share_max=0.5, farther_than_m=60.0), c=100.0)
+    assert (found.whole.found, found.whole.samples) == (0.25, 4)
+    found = one(mission, need("false_tracks", share_max=0.5), c=100.0)
+    assert found.whole.found == 0.0
+
+
+def test_where_truth_says_that_nobody_is_there_every_track_is_false() -> None:
+    """A trial without any target, as false tracks are counted on."""
+    mission: list[Message] = [truth(t, [], []) for t in range(5)]
+    mission += [picture(t, [5], [[0.0, 0.0]]) if t < 2 else picture(t, [], []) for t in range(5)]
+    found = one(mission, need("false_tracks", share_max=0.5), c=100.0)
+    assert (found.whole.found, found.whole.samples) == (1.0, 2)
+    assert one(mission, need("detection", share_min=0.5)).whole.samples == 0
+    scored = assess(Logbook(mission), c=100.0)
+    assert scored.unscored is None
+    assert scored.evaluations["centre"].fused.gospa_false == pytest.approx(2 / 5 * 100.0**2 / 2)
+    assert text([scored]).startswith("Truth tells of no target; fused tracks (ci) were shown 2 times.")
+
+
+def test_of_a_target_that_nobody_ever_tracked_all_updates_are_missing() -> None:
+    """16 s of 8 s each: two are expected, none came."""
+    found = one(lone(16, []), need("gap", longer_than_s=10.0, interval_s=8.0, share_max=0.5))
+    assert (found.whole.found, found.whole.samples) == (1.0, 2)

@@ -39,7 +39,7 @@ longer_than_sec = 5
 interval_s = 1
 share_max = 1.5
 [identities]
-seven = "icao:1"
+seven = 7
 """
 
 
@@ -62,7 +62,7 @@ def test_all_errors_are_told_at_once_with_their_lines(tmp_path: Path) -> None:
         ":22: requirement[4].longer_than_sec: unknown key: did you mean longer_than_s?",
         ":20: requirement[4]: needs longer_than_s",
         ":24: requirement[4].share_max: is 1.5, must be a number from 0 to 1",
-        ":26: identities.seven: is no id of a target",
+        ":26: identities.seven: is 7, must be an identity",
     ):
         assert any(f"{path}{wanted}" in problem for problem in problems), (wanted, problems)
     assert len(problems) == 13
@@ -104,7 +104,7 @@ def test_the_profile_of_the_docs(tmp_path: Path) -> None:
     path.write_text(block.text)
     found = load_profile(str(path))
     assert [area.name for area in found.areas] == ["fairway", "inner"]
-    assert found.identities == {17: "mmsi:257000000"}
+    assert found.identities == {17: "mmsi:257000000", "tern": "mmsi:257000001"}
     page = (ROOT / "docs/requirements.md").read_text("utf-8")
     for kind, keys in KINDS.items():
         row = re.search(rf"^\| `{kind}` \|.*$", page, re.M)
