@@ -17,7 +17,7 @@ GROUND_FLOOR = {
     for name in (
         *("linalg", "geodesy", "hulls", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
         *("errors", "arrays", "order", "records", "turn", "ways", "source_words", "layout", "compiled", "escape"),
-        *("logs", "hangup", "extras", "labels"),
+        *("logs", "hangup", "lifeline", "extras", "labels"),
     )
 }
 STANDS_ON = {
