@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats
 from fusion_service.console.packing import packed
-from fusion_service.console.places import Places, frame_words, places
+from fusion_service.console.places import Places, flat_name, frame_words, places
 from fusion_service.labels import Labels
 from fusion_service.ways import fused_by
-from schemas import GlobalTracks, Local, Wholes
+from schemas import Enu, GlobalTracks, Wholes
 
 __all__ = ["MOST_TRACKS", "TRAIL", "Pictures", "cut"]
 
@@ -76,6 +76,8 @@ class Pictures:
         self._trail: deque[_Point] = deque(maxlen=TRAIL)
         self._marked = -EVERY
         self._ground: object = None
+        self._around = 0.0
+        """The longitude about which the map lies, degrees."""
 
     def take(self, message: GlobalTracks, now: float) -> bool:
         """Take a picture that came at `now`, s; whether it is one to show."""
@@ -95,19 +97,30 @@ class Pictures:
         return True
 
     def _show(self, whole: GlobalTracks, now: float) -> None:
-        where = self.places = places(whole)
+        self._settle(whole)
+        where = self.places = places(whole, self._around)
         rows = np.flatnonzero(where.sound)[:MOST_TRACKS]
         slots = self._slots(whole, rows)
-        ground = (whole.frame if isinstance(whole.frame, Local) else None, isinstance(whole.frame, Local))
-        if ground != self._ground:
-            self._ground = ground
-            self._trail.clear()
         if now - self._marked >= EVERY:
             self._marked = now
             self._trail.append(_Point(slots, where.x[rows], where.y[rows]))
             while sum(len(one.slots) for one in self._trail) > MOST_POINTS:
                 self._trail.popleft()
         self.frame = self._packed(whole, where, rows, slots)
+
+    def _settle(self, whole: GlobalTracks) -> None:
+        """On which ground the picture is: a plane with a name, or the Earth about a longitude, of the first picture."""
+        ground = flat_name(whole.frame)
+        if self.version > 1 and ground == self._ground:
+            return
+        self._trail.clear()
+        if isinstance(whole.frame, Enu):
+            self._around = whole.frame.lon
+        elif ground is None and (there := places(whole)).sound.any():
+            self._around = float(there.x[there.sound][0])
+        elif ground is None:
+            return
+        self._ground = ground
 
     def _slots(self, whole: GlobalTracks, rows: NDArray[np.intp]) -> U32:
         """The slots of these rows; notes their texts, and forgets those of tracks that are gone."""
@@ -140,6 +153,7 @@ class Pictures:
             "step": whole.step,
             "rule": cut(whole.rule),
             "frame": frame_words(whole.frame),
+            "around": self._around,
             "ways": [cut(one) for one in ways],
             "left_out": len(whole.ids) - len(rows),
         }

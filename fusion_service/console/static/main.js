@@ -11,20 +11,31 @@ import { Orders } from "/static/orders.js";
 import { followTheme } from "/static/palette.js";
 import { Stream } from "/static/stream.js";
 import { Track } from "/static/track.js";
-import { Tracks } from "/static/tracks.js";
+import { placed, Tracks } from "/static/tracks.js";
 
 const state = {
   tracks: new Tracks(), places: {}, colours: new Map(), chosen: null, detail: null, health: null, pulse: null, heard: 0,
   centre: "", open: false, why: "", mayOrder: false, offers: null, who: "", stream: null,
   options: { sigmas: 2, trails: true, vectors: true, labels: true, tentative: true, coverage: true, grid: true },
 };
-const chart = new Chart(state.tracks, { base: drawBase(state), picture: drawTracks(state), mark: drawChosen(state) }, (id) => choose(id));
+const chart = new Chart(state.tracks, { base: drawBase(state), picture: drawTracks(state), mark: drawChosen(state) }, ground, (id) => choose(id));
 const list = new List(state, choose);
 const track = new Track(state, act, () => orders.open());
 const orders = new Orders(state);
 const sources = new Sources(state, (source) => orders.open({ source }));
 const alarms = new Alarms();
 const log = new Log(choose);
+
+/** The corners of what is known of the place where there are no tracks: origin of the frame, the centre's
+ *  sensors with their coverage. */
+function ground() {
+  const { frame, around, geo } = state.tracks;
+  const near = (x) => (geo ? x + 360 * Math.round((around - x) / 360) : x);
+  const [x, y] = frame?.kind === "enu" ? [near(frame.lon), frame.lat] : [NaN, NaN];
+  const origin = Number.isFinite(x) ? [[x - 0.1, y - 0.05], [x + 0.1, y + 0.05]] : [];
+  const shown = Object.entries(state.places).filter(([name, one]) => state.colours.has(name) && placed(state.tracks, one));
+  return [...origin, ...shown.flatMap(([, one]) => [one.place, ...one.outline].map(([east, north]) => [near(east), north]))];
+}
 
 function choose(id, look = false) {
   const before = state.chosen;
@@ -162,6 +173,7 @@ function begin(centre) {
     state.tracks.clear();
     log.clear();
     state.health = null;
+    state.colours = new Map();
     choose(null);
     chart.touched = false;
   }
