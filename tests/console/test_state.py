@@ -138,7 +138,7 @@ def test_a_track_is_explained(clocked: Clocked) -> None:
     assert [(one["source"], one["influence"]) for one in told["members"]] == [("r2", 0.75), ("r1", 0.25)]
     assert told["members"][1] == {"source": "r1", "epoch": str(2**63), "id": "0", "influence": 0.25, "d2": 24.0}
     assert [one[1] for one in told["history"]][:3] == ["born", "r1 0 linked, d2 2.5", "took in 10, d2 1.0"]
-    assert told["history"][-1][1] == "3 was split off it"
+    assert told["history"][-1][1] == "split off it: 3, d2 3.0"
     assert told["ellipse"][:2] == pytest.approx([20.0, 10.0], rel=1e-4)
     clocked.state.take(
         picture(2, 5, ids=np.array([FIRST + 1, FIRST + 2], dtype=np.uint64), ended=((FIRST, "lost", FIRST + 1),))
