@@ -97,7 +97,9 @@ class Histories:
             for entry in entries[:ROWS]:
                 counts[entry.source, entry.reason, "tracks" if entry.count else "messages"] += entry.count or 1
             for (source, reason, what), count in sorted(counts.items())[:A_STEP]:
-                self.say(at, "refusal", f"{source}: {count} {what} {verb} ({reason})", True)
+                self.say(
+                    at, "refusal", f"{source}: {count} {what if count != 1 else what[:-1]} {verb} ({reason})", True
+                )
         for event in log.events[:A_STEP]:
             self._event(event, at)
         self._decisions(log, at)

@@ -28,6 +28,8 @@ TRAIL = 60
 """Points in time of the trails."""
 EVERY = 1.0
 """Seconds between two of them at least."""
+GAPS, FEW = 120, 20
+"""Times between two pictures by which the usual one is known: at most, and so many that one may be an outage."""
 MOST_POINTS = 600_000
 LONGEST = 80
 """Characters of a text that are shown."""
@@ -60,7 +62,7 @@ def cut(text: Any) -> str:
 
 class Pictures:
     """What is known of the pictures of one centre. version: grows with each; frame: the newest as bytes; whole, places:
-    it, and where its tracks are; received: when it came, monotonic s; interval: s between pictures, smoothed."""
+    it, and where its tracks are; received: when it came, monotonic s."""
 
     def __init__(self) -> None:
         self.version = 0
@@ -68,8 +70,9 @@ class Pictures:
         self.whole: GlobalTracks | None = None
         self.places: Places | None = None
         self.received = 0.0
-        self.interval = 0.0
         self.label = Labels()
+        self._gaps: deque[float] = deque(maxlen=GAPS)
+        self._interrupted = False
         self._wholes = Wholes()
         self._texts: dict[int, _Texts] = {}
         self._next = 0
@@ -89,12 +92,24 @@ class Pictures:
             return False
         self.label.see(message)
         if self.whole is not None:
-            apart = now - self.received
-            self.interval = apart if not self.interval else self.interval + 0.2 * (apart - self.interval)
+            if not self._interrupted:
+                self._gaps.append(now - self.received)
+        self._interrupted = False
         self.whole, self.received = whole, now
         self.version += 1
         self._show(whole, now)
         return True
+
+    @property
+    def interval(self) -> float:
+        """The usual time between two pictures, s, where they come several at a time that between two times: the longest
+        of the last ones, or of many the longest but one."""
+        gaps = sorted(self._gaps)
+        return gaps[-1 - (len(gaps) >= FEW)] if gaps else 0.0
+
+    def interrupted(self) -> None:
+        """Centre or hub has gone: until the next picture is no usual time."""
+        self._interrupted = True
 
     def _show(self, whole: GlobalTracks, now: float) -> None:
         self._settle(whole)

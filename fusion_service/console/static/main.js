@@ -89,7 +89,7 @@ function showCondition() {
   say(byId("link").lastElementChild, words);
   const banner = byId("banner");
   banner.hidden = how === "live" || (how === "waiting" && !state.tracks.count);
-  say(banner, `Stale: ${words}`);
+  say(banner, state.tracks.picture ? `Stale: ${words}` : words);
   const own = how === "closed" || how === "stale" ? [{ text: words, since: null }] : [];
   alarms.show(state.health, own);
 }
