@@ -6,6 +6,8 @@ import { RADIUS, unit } from "/static/tracks.js";
 
 const NEAR = 14;
 const BAR = 110;
+/** Px that are left free where all is shown: of the tools on the left, and of names of tracks and axes on the right. */
+const [TOOLS, NAMES] = [[112, 36], [64, 60]];
 
 export class Chart {
   /** tracks: what is drawn; base, picture, mark: the drawings, the lowest first; ground(): the pairs of places that are
@@ -118,7 +120,7 @@ export class Chart {
   /** Show what lies between two corners. */
   look(corners) {
     this.fitting = true;
-    this.map.fitBounds(corners, { padding: [36, 36], maxZoom: this.geo ? 16 : 8, animate: false });
+    this.map.fitBounds(corners, { paddingTopLeft: TOOLS, paddingBottomRight: NAMES, maxZoom: this.geo ? 16 : 8, animate: false });
     this.fitting = false;
   }
 
