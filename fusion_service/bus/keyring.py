@@ -72,8 +72,8 @@ class Keyring:
             if not (asked or hosts or renewed or gone):
                 return  # who there is can be told without it
             raise SecurityError(
-                f"{self._folder}: there are keys ({', '.join(there[:3])}), but no authority/ca.key, which alone can add "
-                "to them or renew them: bring it back, or make all anew in another folder"
+                f"{self._folder}: there are keys ({', '.join(there[:3])}), but no authority/ca.key, which alone can "
+                "add to them or renew them: bring it back, or make all anew in another folder"
             )
         if first and not asked:
             raise SecurityError(

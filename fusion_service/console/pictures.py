@@ -91,9 +91,8 @@ class Pictures:
         if whole is None:
             return False
         self.label.see(message)
-        if self.whole is not None:
-            if not self._interrupted:
-                self._gaps.append(now - self.received)
+        if self.whole is not None and not self._interrupted:
+            self._gaps.append(now - self.received)
         self._interrupted = False
         self.whole, self.received = whole, now
         self.version += 1

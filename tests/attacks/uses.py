@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 
 import msgpack
 
@@ -47,13 +48,17 @@ def viewer(lab: Lab) -> bool:
         return whole and lab.wait(lambda: bool(heard), 3.0)
 
 
+def _note(keys: list[str], key: str, data: bytes) -> None:
+    keys.append(key)
+
+
 def sensors_seen(lab: Lab) -> bool:
     """A viewer and an operator that join late hear what a radar has said of itself, and nothing else of it."""
     heard: dict[str, list[str]] = {"viewer-wall": [], "operator-bob": []}
     with ExitStack() as stack:
         for party, keys in heard.items():
             bus = stack.enter_context(open_bus([lab.endpoint], wait=10.0, security=lab.security(party)))
-            bus.subscribe(f"{V1}/local/*/info", lambda key, data, keys=keys: keys.append(key))
+            bus.subscribe(f"{V1}/local/*/info", partial(_note, keys))
         return lab.wait(
             lambda: lab.report() and all(set(keys) == {f"{V1}/local/r1/info"} for keys in heard.values()), 3
         )

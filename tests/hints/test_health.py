@@ -52,14 +52,14 @@ def test_what_is_old_or_harmless_is_not_wrong() -> None:
 
 
 def test_a_source_that_was_mended_is_well_and_was_wrong() -> None:
-    def row(now: int, **more: int) -> Row:
+    def row(now: int, **more: Any) -> Row:
         last = {"reason": "late", "count": 3, "time": NOW - 20 * 10**9, "said": "mend it", **more}
         source = {**STATUS.sources["a"], "last_refusal": last}
         (found,) = health_of(replace(STATUS, sources={"a": source}), None, now).rows
         return found
 
     for more in ({}, {"well": NOW - 15 * 10**9}, {"well": NOW - 21 * 10**9}, {"well": "x"}):
-        assert row(NOW, **more).faults == ("refused (late, 3 times): mend it",)  # type: ignore[arg-type]
+        assert row(NOW, **more).faults == ("refused (late, 3 times): mend it",)
     mended = row(NOW, well=NOW - 10**9)
     assert (mended.faults, mended.state, mended.reason) == ((), "there", "")
     assert mended.more == ("well since; refused until 20 s ago (late, 3 times): mend it",)
