@@ -14,6 +14,7 @@ import pytest
 import schemas
 from fusion_service.bus import Publisher
 from schemas import GlobalTracks, Status, StepLog
+from sensor_clients.publisher import TrackPublisher
 from tests.console.scenes import FIRST, picture, status, step_log
 from tests.helpers.browser import CHROMIUM, Browser, Page
 from tests.helpers.processes import Hub, Program, eventually, free_endpoint
@@ -31,6 +32,14 @@ WIDE = """(() => {
   const shown = [...document.querySelectorAll('main *')].filter((one) => one.checkVisibility() && !one.closest('#map'));
   const right = shown.map((one) => one.getBoundingClientRect().right);
   return Math.max(document.documentElement.scrollWidth, ...right);
+})()"""
+IS_FULL = """(() => {
+  const [x, y] = fusionConsole.sensor('buoy');
+  const map = document.querySelector('#map').getBoundingClientRect();
+  const canvas = document.querySelector('canvas.drawn:not([hidden])');
+  const box = canvas.getBoundingClientRect();
+  const [left, top] = [map.x + x - box.x, map.y + y - box.y].map(Math.round);
+  return canvas.getContext('2d').getImageData(left - 2, top + 1, 1, 1).data[3] > 200;
 })()"""
 IS_DRAWN = """(() => {
   const [x, y] = fusionConsole.at(%s);
@@ -259,6 +268,7 @@ def test_the_map_goes_on_over_the_date_line_and_shows_the_place_where_there_is_n
         bus.publisher(schemas.global_key("fiji", "tracks")),
         bus.announce(schemas.global_key("fiji", "alive")),
     )
+    health, stack = bus.publisher(schemas.global_key("fiji", "status")), ExitStack()
     seen = "document.querySelector('#map').dataset.tracks"
     try:
         tracks.put(schemas.encode(picture(3, name="fiji", frame=fiji)))
@@ -273,7 +283,15 @@ def test_the_map_goes_on_over_the_date_line_and_shows_the_place_where_there_is_n
         page.until(f"{seen} === '0'")
         page.js("document.querySelector('#fit').click()")
         page.until("/^\\d+ m$|^[1-9]\\d?\\.\\d km$/.test(document.querySelector('#scale .say').innerText)")
+        buoy = stack.enter_context(TrackPublisher("buoy", connect=room.scene.endpoint, wait=20.0))
+        buoy.info(frame=fiji, position=(2000.0, 1000.0, 5.0), period=1.0, motion=schemas.Motion("cv", q=1.0))
+        for there in (True, False):  # a full sign, and a hollow one when it has gone
+            said = status(sources={"buoy": {"alive": there, "messages": 1}}, name="fiji")
+            health.put(schemas.encode(said))
+            page.until(f"({IS_FULL}) === {json.dumps(there)}")
     finally:
+        stack.close()
+        health.close()
         tracks.close()
         token.close()
         page.js(PICK % ("#centre", "centre"))

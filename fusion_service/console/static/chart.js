@@ -93,9 +93,14 @@ export class Chart {
 
   /** Where a row is on the screen, px in the map. */
   pixel(row) {
+    return this.place([this.tracks.wx[row], this.tracks.wy[row]]);
+  }
+
+  /** Where a place in the map's unit is on the screen. */
+  place([wx, wy]) {
     const { x, y } = this.map.getPixelBounds().min;
     const scale = (this.geo ? 256 : 1) * 2 ** this.map.getZoom();
-    return [this.tracks.wx[row] * scale - x, this.tracks.wy[row] * scale - y];
+    return [wx * scale - x, wy * scale - y];
   }
 
   /** Show all tracks, but for the few that are far from all others. */

@@ -4,6 +4,8 @@ import { clean, metres, round125, within180 } from "/static/dom.js";
 import { palette } from "/static/palette.js";
 import { placed, unit, world } from "/static/tracks.js";
 
+/** States of sources that see nothing at the moment: hollow, and their coverage not filled. */
+const AWAY = ["gone", "silent", "unheard", "resting"];
 const APART = 110;
 /** Px between two lines at least, and between two of their names. */
 const [LEAST, GAP] = [84, 26];
@@ -94,21 +96,22 @@ function rings(context, view, frame, around) {
   context.stroke();
 }
 
-function sensors(context, view, { places, colours, tracks }) {
+function sensors(context, view, { places, colours, states, tracks }) {
   for (const [name, one] of Object.entries(places)) {
     const there = placed(tracks, one);
     if (!there) continue;
     const path = one.outline.map(there);
+    const away = AWAY.includes(states.get(name)) ? states.get(name) : "";
     context.strokeStyle = context.fillStyle = colours.get(name) ?? palette.cover;
     if (path.length) {
       context.beginPath();
       path.forEach(([wx, wy]) => context.lineTo(wx * view.scale - view.left, wy * view.scale - view.top));
       context.closePath();
       context.globalAlpha = 0.05;
-      context.fill();
-      context.globalAlpha = 0.7;
+      if (!away) context.fill();
+      context.globalAlpha = away ? 0.35 : 0.7;
       context.lineWidth = 1;
-      context.setLineDash([6, 4]);
+      context.setLineDash(away ? [2, 8] : [6, 4]);
       context.stroke();
       context.setLineDash([]);
     }
@@ -120,9 +123,11 @@ function sensors(context, view, { places, colours, tracks }) {
     context.lineTo(px + 5.5, py + 4);
     context.lineTo(px - 5.5, py + 4);
     context.closePath();
-    context.fill();
+    context.lineWidth = 1.5;
+    if (away) context.stroke();
+    else context.fill();
     context.fillStyle = palette.text;
-    context.fillText(clean(name).slice(0, 24), px + 8, py + 12);
+    context.fillText(`${clean(name).slice(0, 24)}${away && ` (${away})`}`, px + 8, py + 12);
   }
 }
 

@@ -14,7 +14,7 @@ import { Track } from "/static/track.js";
 import { placed, Tracks } from "/static/tracks.js";
 
 const state = {
-  tracks: new Tracks(), places: {}, colours: new Map(), chosen: null, detail: null, health: null, pulse: null, heard: 0,
+  tracks: new Tracks(), places: {}, colours: new Map(), states: new Map(), chosen: null, detail: null, health: null, pulse: null, heard: 0,
   centre: "", open: false, why: "", mayOrder: false, offers: null, who: "", stream: null,
   options: { sigmas: 2, trails: true, vectors: true, labels: true, tentative: true, coverage: true, grid: true },
 };
@@ -151,10 +151,12 @@ const takes = {
   health(message) {
     state.health = message;
     state.colours = new Map(message.sources.map((one) => [one.name, one.colour]));
+    state.states = new Map(message.sources.map((one) => [one.name, one.state]));
     sources.show(message);
     showCondition();
-    if (JSON.stringify([...state.colours]) !== chart.coloured) {
-      chart.coloured = JSON.stringify([...state.colours]);
+    const coloured = JSON.stringify([...state.colours, ...state.states]);
+    if (coloured !== chart.coloured) {
+      chart.coloured = coloured;
       chart.redraw("base", "mark");
     }
   },
@@ -174,6 +176,7 @@ function begin(centre) {
     log.clear();
     state.health = null;
     state.colours = new Map();
+    state.states = new Map();
     choose(null);
     chart.touched = false;
   }
@@ -207,8 +210,9 @@ state.stream = new Stream(() => ({ centre: state.centre, track: state.chosen }),
 setInterval(showCondition, 1000);
 byId("layers").open = false;
 
-/** For tests and measurements: where a track is on the screen, and what drawing took. */
+/** For tests and measurements: where a track and a sensor are on the screen, and what drawing took. */
 globalThis.fusionConsole = {
   at: (id) => (state.tracks.row(id) < 0 ? null : chart.pixel(state.tracks.row(id))),
+  sensor: (name) => chart.place(placed(state.tracks, state.places[name])(state.places[name].place)),
   figures: () => ({ tracks: state.tracks.count, bytes: state.stream.bytes, took: chart.layers?.map((one) => one.took) ?? [] }),
 };
