@@ -227,7 +227,7 @@ def _faults(said: Mapping[str, Any], state: str, last: Mapping[str, Any]) -> lis
     if state == "gone":
         found.append("it is gone: its liveliness token is no more")
     if last and last.get("reason") not in BENIGN:
-        found.append(f"refused ({last.get('reason')}, {_count(last)} times): {last.get('said')}")
+        found.append(f"refused ({last.get('reason')}, {_times(last)}): {last.get('said')}")
     if state == "silent" or (state == "resting" and said.get("messages")):
         found.append("it is silent: its newest tracks are stale" + "; it rests" * (state == "resting"))
     elif state == "unheard":
@@ -246,11 +246,16 @@ def _more(said: Mapping[str, Any], state: str, now: int | None) -> list[str]:
     """What else is known of a source that a person should read. now: ns, where its last refusal was lately."""
     last, lines = said.get("last_refusal"), []
     if isinstance(last, Mapping) and last.get("reason") in BENIGN:
-        lines.append(f"refused ({last.get('reason')}, {_count(last)} times): {last.get('said')}")
+        lines.append(f"refused ({last.get('reason')}, {_times(last)}): {last.get('said')}")
     elif now is not None and isinstance(last, Mapping) and _mended(last):
-        before = f"refused until {span((now - last['time']) / 1e9)} ago ({last.get('reason')}, {_count(last)} times)"
+        before = f"refused until {span((now - last['time']) / 1e9)} ago ({last.get('reason')}, {_times(last)})"
         lines.append(f"well since; {before}: {last.get('said')}")
     return [*([STATES[state]] if state in ("resting", "muted") else []), *lines, *source_health(said)]
+
+
+def _times(last: Mapping[str, Any]) -> str:
+    count = _count(last)
+    return "once" if count == 1 else f"{count} times"
 
 
 def _count(last: Mapping[str, Any]) -> int:

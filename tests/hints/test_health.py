@@ -63,6 +63,7 @@ def test_a_source_that_was_mended_is_well_and_was_wrong() -> None:
     mended = row(NOW, well=NOW - 10**9)
     assert (mended.faults, mended.state, mended.reason) == ((), "there", "")
     assert mended.more == ("well since; refused until 20 s ago (late, 3 times): mend it",)
+    assert row(NOW, well=NOW, count=1).more == ("well since; refused until 20 s ago (late, once): mend it",)
     assert row(NOW + 41 * 10**9, well=NOW).more == ()
 
 

@@ -60,7 +60,11 @@ def test_an_operator_orders_lists_and_withdraws(scene: Scene, capsys: pytest.Cap
         "fusion-service order: no centre named center answers, but centre: give --centre centre\n",
     )
     for answer in (b"\xc1", b"\x05", msgpack.packb({"orders": [{}]}), msgpack.packb({"orders": [{"number": []}]})):
-        forged = scene.bus.answer(schemas.global_key("forged", "orders"), lambda _, said=answer: said)
+
+        def forge(_: bytes | None, said: bytes = answer) -> bytes:
+            return said
+
+        forged = scene.bus.answer(schemas.global_key("forged", "orders"), forge)
         assert order("list", "--centre", "forged")[::2] == (
             1, "fusion-service order: the answer in the name of centre forged cannot be read: who is it?\n"
         )  # fmt: skip
