@@ -23,6 +23,7 @@ from typing import Any, NoReturn, TextIO, TypeVar, cast
 
 from fusion_service.escape import Escaped, escaped, into_nothing
 from fusion_service.hangup import heed
+from fusion_service.lifeline import end_with_parent
 
 __all__ = [
     "GRACE",
@@ -50,7 +51,7 @@ _LOADING = threading.Event()
 @contextmanager
 def stop_on_signals(lasting: bool = False) -> Iterator[threading.Event]:
     """An event that SIGINT or SIGTERM sets. A second signal, or `GRACE` seconds, end the process at once. lasting:
-    SIGHUP does not end it (see `hangup`).
+    SIGHUP does not end it (see `hangup`). It is set too when who started the process has gone (see `lifeline`).
 
     Both is left to the kernel, so that it also happens while a long call holds the interpreter; only the first
     signal needs Python to run once.
@@ -76,6 +77,7 @@ def stop_on_signals(lasting: bool = False) -> Iterator[threading.Event]:
     for number in handled:
         signal.signal(number, on_signal)
     try:
+        end_with_parent()
         with heed(lambda: on_signal(signal.SIGHUP, None)) if lasting else nullcontext():
             yield stop
     finally:

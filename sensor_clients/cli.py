@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from fusion_service import __version__
-from fusion_service.bus import DEFAULT_ENDPOINT, check_endpoint
+from fusion_service.bus import DEFAULT_ENDPOINT
 from fusion_service.bus.options import bus_options
 from fusion_service.errors import UsageError
 from fusion_service.process import Parser, argument, data_folder, exit_code, positive, stop_on_signals, whole
-from schemas import REALM, check_realm
+from schemas import check_realm
 from sensor_clients.events import Event, Scenario
 from sensor_clients.faults import faulty, read_fault
 from sensor_clients.playback import autoferry, mrclam, radar_v2x, table
@@ -86,15 +86,7 @@ def _parser() -> argparse.ArgumentParser:
     playback.set_defaults(run=_playback)
     for command in (simulate, playback):
         command.add_argument("--sensor", required=True, help="which of the scenario's sensors, or truth")
-        command.add_argument(
-            "--connect",
-            type=argument(check_endpoint),
-            default=DEFAULT_ENDPOINT,
-            help=f"the hub (default {DEFAULT_ENDPOINT})",
-        )
-        command.add_argument(
-            "--security", type=Path, metavar="FILE", help="certificates of this sensor (see `fusion-service keys`)"
-        )
+        bus_options(command, "certificates of this sensor")
         command.add_argument(
             "--fault",
             type=argument(read_fault),
@@ -102,7 +94,6 @@ def _parser() -> argparse.ArgumentParser:
             help="make the source wrong on purpose: clock and delay (s), x and y (m), heading (degrees), range (m), "
             "scale, sigma (factor), loss (share), stuck (s)",
         )
-        command.add_argument("--realm", default=REALM, help=f"first part of every key (default {REALM})")
         command.add_argument(
             "--speed", type=argument(positive), default=1.0, help="scenario seconds per second (default 1)"
         )
@@ -229,7 +220,7 @@ def _publish(
     if arguments.duration is not None:
         end = scenario.start + round(arguments.duration * 1e9)
         events = itertools.takewhile(lambda event: event.time <= end, events)
-    where = {"connect": arguments.connect, "realm": arguments.realm, "origin": scenario.origin}
+    where = {"connect": arguments.connect or DEFAULT_ENDPOINT, "realm": arguments.realm, "origin": scenario.origin}
     where["security"] = arguments.security
     if kind is TrackPublisher:
         where["lineage"] = lineage

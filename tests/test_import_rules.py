@@ -16,8 +16,20 @@ GROUND_FLOOR = {
     f"fusion_service.{name}"
     for name in (
         *("linalg", "geodesy", "hulls", "motion", "coverage", "metrics", "existence", "process", "progress", "colours"),
-        *("errors", "arrays", "order", "records", "turn", "ways", "source_words", "layout", "compiled", "escape"),
-        *("logs", "hangup", "extras", "labels"),
+        *(
+            "errors",
+            "arrays",
+            "order",
+            "records",
+            "turn",
+            "ways",
+            "source_words",
+            "decision_words",
+            "layout",
+            "compiled",
+            "escape",
+        ),
+        *("logs", "hangup", "lifeline", "decision_words", "extras", "labels"),
     )
 }
 STANDS_ON = {

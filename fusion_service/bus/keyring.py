@@ -68,6 +68,13 @@ class Keyring:
             if len(party.common_name) > 64:
                 raise SecurityError(f"{party.name}: too long for a certificate: at most {63 - len(party.role)} letters")
         first = not (self._folder / "authority" / "ca.key").exists()
+        if first and (there := sorted(one.parent.name for one in self._folder.glob(f"*/{FILE}"))):
+            if not (asked or hosts or renewed or gone):
+                return  # who there is can be told without it
+            raise SecurityError(
+                f"{self._folder}: there are keys ({', '.join(there[:3])}), but no authority/ca.key, which alone can "
+                "add to them or renew them: bring it back, or make all anew in another folder"
+            )
         if first and not asked:
             raise SecurityError(
                 f"{self._folder}: no keys there: name the parties, as in --source radar-1 --centre centre"

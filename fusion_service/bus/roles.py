@@ -10,10 +10,12 @@ token. Who reads may subscribe, look for tokens, and ask publishers for samples 
 | source | `local/{name}/**` | nothing |
 | centre | `global/{name}/**`, queryables `picture`, `orders`, `state` | `local/**`, `global/**`, its own `state` |
 | recorder | `record/{name}/**` | everything but questions and answers |
-| viewer | nothing | `global/**`, `record/**`; asks for `picture`, and recorders for their `state` |
+| viewer | nothing | `global/**`, `record/**`, `local/*/info`; asks for `picture`, and recorders for `state` |
 | operator | nothing | as a viewer; gives orders on `global/*/orders/{name}` alone |
-| gateway | `local/{name}/**` | as a viewer |
+| gateway | `local/{name}/**` | as a viewer, without `local/*/info` |
 | scenario | `truth/{name}` | nothing: for simulations |
+
+So a viewer sees where sensors stand and what they cover, but hears none of their tracks.
 """
 
 from __future__ import annotations
@@ -81,7 +83,8 @@ def hello_key(common: str) -> str:
 def rights(party: Party) -> Rights:
     """What a party may do."""
     role, name = party.role, party.name
-    looks = ("global/**", "record/**")
+    results = ("global/**", "record/**")
+    looks = (*results, "local/*/info")
     asks = ("global/*/picture", "record/*/state")
     picture = asks[0]
     return {
@@ -95,7 +98,7 @@ def rights(party: Party) -> Rights:
         "recorder": Rights(own=(f"record/{name}/**",), read=("**",), asked=asks[1:]),
         "viewer": Rights(read=looks, ask=asks),
         "operator": Rights(read=looks, ask=(*asks, f"global/*/orders/{name}")),
-        "gateway": Rights(own=(f"local/{name}/**",), read=looks, ask=asks),
+        "gateway": Rights(own=(f"local/{name}/**",), read=results, ask=asks),
         "scenario": Rights(own=(f"truth/{name}",)),
     }[role]
 

@@ -22,12 +22,13 @@ then
   fusion-service hub --security keys/hub
   fusion-service run --security keys/centre-centre
   sensor-client simulate three-radars --sensor radar1 --security keys/source-radar1"""
+MOST_DAYS = 3650
 MEANINGS = {
     "source": "publishes tracks under its own name, reads nothing",
     "centre": "fuses; the name is [centre] name",
     "recorder": "reads all, says nothing",
-    "operator": "reads the picture, gives orders under its own name",
-    "viewer": "reads the picture",
+    "operator": "reads the picture and where sensors stand, gives orders under its own name",
+    "viewer": "reads the picture, and where sensors stand",
     "gateway": "a source that also reads the picture",
     "scenario": "publishes the truth of a simulation",
 }
@@ -37,6 +38,12 @@ def _name(text: str) -> str:
     from schemas import check_name
 
     return check_name(text)
+
+
+def _days(text: str) -> float:
+    if (days := positive(text)) > MOST_DAYS:
+        raise ValueError(f"{text!r} is more than {MOST_DAYS} days, for which the authority itself holds")
+    return days
 
 
 def _realm(text: str) -> str:
@@ -66,9 +73,7 @@ def add(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--renew", action="append", default=[], metavar="PARTY", help="role:name, or hub")
     parser.add_argument("--remove", action="append", default=[], metavar="PARTY", help="role:name")
-    parser.add_argument(
-        "--days", type=argument(positive), default=365.0, help="how long certificates hold (default 365)"
-    )
+    parser.add_argument("--days", type=argument(_days), default=365.0, help="how long certificates hold (default 365)")
     parser.add_argument(
         "--realm", type=argument(_realm), help="first part of every key (default: as before, or fusion)"
     )

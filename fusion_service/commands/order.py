@@ -73,6 +73,7 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
     from fusion_service.bus import DEFAULT_ENDPOINT, open_bus
     from fusion_service.bus.security import check_party, maybe_security
     from fusion_service.errors import OrderError, UsageError
+    from fusion_service.hints.elsewhere import no_centre
     from schemas import global_key, order_key
 
     security = maybe_security(args.security)
@@ -91,14 +92,24 @@ def run(args: argparse.Namespace, stop: threading.Event) -> None:
         raise UsageError(f"{args.what}: it needs {missing}")
     with open_bus(args.connect or [DEFAULT_ENDPOINT], wait=ANSWER, stop=stop, security=security) as bus:
         answers = bus.ask(key, msgpack.packb(request), ANSWER)
+        there = [] if answers else bus.present(global_key("*", "alive", args.realm))[0]
     if not answers:
-        raise OrderError(f"no centre named {args.centre} answers: is `fusion-service run` there, under this name?")
-    answer = msgpack.unpackb(answers[0][1])
-    if args.what == "list":
+        raise OrderError(no_centre(args.centre, [one.split("/")[-2] for one in there]))
+    try:
+        _tell(args.what, msgpack.unpackb(answers[0][1]))
+    except (LookupError, TypeError, ValueError, AttributeError, OverflowError, OSError):
+        raise OrderError(f"the answer in the name of centre {args.centre} cannot be read: who is it?") from None
+
+
+def _tell(what: str, answer: dict[str, Any]) -> None:
+    """Print what a centre has answered. Raises `OrderError` for what it refuses, and others for what is no answer."""
+    from fusion_service.errors import OrderError
+
+    if what == "list":
         print(_table(answer["orders"]))
-    elif args.what == HANDOVER and answer["done"]:
+    elif what == HANDOVER and answer["done"]:
         print(answer["outcome"])
-    elif args.what == HANDOVER:
+    elif what == HANDOVER:
         raise OrderError(f"no handover: {answer['outcome']}")
     elif answer["done"]:
         more = ", when a step is made: none is at the moment" if answer.get("pending") else ""

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+from fusion_service.decision_words import made_again
+
 __all__ = ["event_words", "local_words", "short"]
 
 LONGEST = 120
 MOST = 6
-"""Values of an event that is not known, and names of a list, that are told."""
+"""Values of an event that is not known that are told."""
 
 
 def event_words(kind: str, event: Mapping[str, Any], at: int) -> str:
@@ -18,9 +20,7 @@ def event_words(kind: str, event: Mapping[str, Any], at: int) -> str:
         kept = "checkpoint" in event or "left_out" in event
         return f"the service began{' anew from its checkpoint' if kept else ', without a checkpoint'}"
     if kind == "revised":
-        since = event.get("since")
-        back = f" from {(at - since // 10**6) / 1e3:.1f} s before on" if type(since) is int else ""
-        return f"steps were made again{back}, with late data of {_names(event.get('sources'))}"
+        return f"steps were {made_again(event, at * 10**6)}"
     if kind == "skipped":
         return f"{short(event.get('steps'))} steps were skipped: more comes than can be worked off"
     if kind == "era":
@@ -53,8 +53,3 @@ def local_words(value: Any) -> str:
 def short(value: Any) -> str:
     """Any value as a text of bounded length."""
     return f"{len(value)} bytes" if isinstance(value, bytes) else str(value)[:LONGEST]
-
-
-def _names(value: Any) -> str:
-    names = [short(one) for one in value] if isinstance(value, (list, tuple)) else []
-    return f"{', '.join(names[:MOST])}{f' and {len(names) - MOST} more' if len(names) > MOST else ''}" or "nobody"

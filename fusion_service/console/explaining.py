@@ -9,8 +9,9 @@ import numpy as np
 
 from fusion_service.console.histories import Histories
 from fusion_service.console.pictures import Pictures, cut
+from fusion_service.console.places import flat_name
 from fusion_service.ways import fused_by
-from schemas import ORIGINS, STATUSES, GlobalTracks, Local
+from schemas import ORIGINS, STATUSES, GlobalTracks
 from schemas.messages import MARKS
 
 __all__ = ["explained"]
@@ -49,7 +50,7 @@ def explained(track: int, pictures: Pictures, histories: Histories) -> dict[str,
         "origin": origin,
         "marks": [MARK_WORDS[name] for bit, name in enumerate(MARKS) if _marks(whole, row) >> bit & 1],
         "what": [one for one in (_what(whole, "identity", row), _what(whole, "kind", row)) if one],
-        "geo": not isinstance(whole.frame, Local),
+        "geo": flat_name(whole.frame) is None,
         "place": [_number(where.x[row]), _number(where.y[row]), _number(where.height[row])],
         "ellipse": [_number(where.major[row]), _number(where.minor[row]), _number(where.turn[row])],
         "velocity": [_number(where.vx[row]), _number(where.vy[row])],

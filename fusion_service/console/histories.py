@@ -14,23 +14,12 @@ from typing import Any
 import numpy as np
 
 from fusion_service.console.events import event_words, local_words, short
+from fusion_service.decision_words import MINE, SAID, THEIRS
 from fusion_service.labels import Labels
 from fusion_service.order import giver_of
 from fusion_service.source_words import source_event
 from schemas import GlobalTracks, StepLog
-from schemas.messages import (
-    BORN,
-    BROKEN,
-    COASTING_NOW,
-    CONFIRMED_NOW,
-    DELETED,
-    EXCHANGED,
-    GATE_FAILED,
-    KEPT,
-    LINKED,
-    MERGED,
-    SPLIT,
-)
+from schemas.messages import BROKEN, CONFIRMED_NOW, DELETED, EXCHANGED, GATE_FAILED, KEPT, LINKED, MERGED, SPLIT
 
 __all__ = ["Histories"]
 
@@ -43,15 +32,6 @@ A_STEP = 25
 ROWS = 20_000
 """Decisions of a step that are read."""
 LONGEST = 240
-WORDS = {
-    LINKED: "linked",
-    GATE_FAILED: "outside its gate",
-    BROKEN: "broken off",
-    BORN: "born",
-    CONFIRMED_NOW: "confirmed",
-    COASTING_NOW: "coasts: no source has it",
-    DELETED: "ended: lost",
-}
 IN_THE_LOG = (CONFIRMED_NOW, BROKEN, MERGED, SPLIT, DELETED, EXCHANGED)
 BESIDE = ("found", "lost", "restarted")
 
@@ -117,7 +97,9 @@ class Histories:
             for entry in entries[:ROWS]:
                 counts[entry.source, entry.reason, "tracks" if entry.count else "messages"] += entry.count or 1
             for (source, reason, what), count in sorted(counts.items())[:A_STEP]:
-                self.say(at, "refusal", f"{source}: {count} {what} {verb} ({reason})", True)
+                self.say(
+                    at, "refusal", f"{source}: {count} {what if count != 1 else what[:-1]} {verb} ({reason})", True
+                )
         for event in log.events[:A_STEP]:
             self._event(event, at)
         self._decisions(log, at)
@@ -174,14 +156,11 @@ class Histories:
         member, value = _member(log, row), float(log.decisions.value[row])
         d2 = f", d2 {value:.1f}" if math.isfinite(value) else ""
         whom = f"{member[0]} {member[2]} " if member is not None else ""
-        if kind == MERGED:
-            return f"merged into {self._label(other)}{d2}", f"took in {{}}{d2}" if other else ""
-        if kind == SPLIT:
-            return f"split from {self._label(other)}{d2}", "{} was split off it" if other else ""
-        if kind == EXCHANGED:
-            text = f"{whom}comes over by exchange from {self._label(other)}{d2}"
-            return text, f"{_plain(whom)}goes over by exchange to {{}}" if other else ""
-        return f"{whom}{WORDS.get(kind, f'decision {kind}')}{d2 if member is not None else ''}", ""
+        if kind in MINE:
+            back = f"{_plain(whom)}{THEIRS[kind]} {{}}{d2}" if other else ""
+            return f"{whom}{MINE[kind]} {self._label(other)}{d2}", back
+        said = f"ended: {SAID[kind]}" if kind == DELETED else SAID.get(kind, f"decision {kind}")
+        return f"{whom}{said}{d2 if member is not None else ''}", ""
 
     def _note(self, track: int, at: int, words: str, again: bool = False) -> None:
         """A line of a track; again: it may go on from step to step; the numbers are those of the last."""

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from fusion_service.arrays import Floats
 from fusion_service.console.packing import packed
-from fusion_service.console.places import Places, frame_words, places
+from fusion_service.console.places import Places, flat_name, frame_words, places
 from fusion_service.labels import Labels
 from fusion_service.ways import fused_by
-from schemas import GlobalTracks, Local, Wholes
+from schemas import Enu, GlobalTracks, Wholes
 
 __all__ = ["MOST_TRACKS", "TRAIL", "Pictures", "cut"]
 
@@ -28,6 +28,8 @@ TRAIL = 60
 """Points in time of the trails."""
 EVERY = 1.0
 """Seconds between two of them at least."""
+GAPS, FEW = 120, 20
+"""Times between two pictures by which the usual one is known: at most, and so many that one may be an outage."""
 MOST_POINTS = 600_000
 LONGEST = 80
 """Characters of a text that are shown."""
@@ -60,7 +62,7 @@ def cut(text: Any) -> str:
 
 class Pictures:
     """What is known of the pictures of one centre. version: grows with each; frame: the newest as bytes; whole, places:
-    it, and where its tracks are; received: when it came, monotonic s; interval: s between pictures, smoothed."""
+    it, and where its tracks are; received: when it came, monotonic s."""
 
     def __init__(self) -> None:
         self.version = 0
@@ -68,14 +70,17 @@ class Pictures:
         self.whole: GlobalTracks | None = None
         self.places: Places | None = None
         self.received = 0.0
-        self.interval = 0.0
         self.label = Labels()
+        self._gaps: deque[float] = deque(maxlen=GAPS)
+        self._interrupted = False
         self._wholes = Wholes()
         self._texts: dict[int, _Texts] = {}
         self._next = 0
         self._trail: deque[_Point] = deque(maxlen=TRAIL)
         self._marked = -EVERY
         self._ground: object = None
+        self._around = 0.0
+        """The longitude about which the map lies, degrees."""
 
     def take(self, message: GlobalTracks, now: float) -> bool:
         """Take a picture that came at `now`, s; whether it is one to show."""
@@ -86,28 +91,50 @@ class Pictures:
         if whole is None:
             return False
         self.label.see(message)
-        if self.whole is not None:
-            apart = now - self.received
-            self.interval = apart if not self.interval else self.interval + 0.2 * (apart - self.interval)
+        if self.whole is not None and not self._interrupted:
+            self._gaps.append(now - self.received)
+        self._interrupted = False
         self.whole, self.received = whole, now
         self.version += 1
         self._show(whole, now)
         return True
 
+    @property
+    def interval(self) -> float:
+        """The usual time between two pictures, s, where they come several at a time that between two times: the longest
+        of the last ones, or of many the longest but one."""
+        gaps = sorted(self._gaps)
+        return gaps[-1 - (len(gaps) >= FEW)] if gaps else 0.0
+
+    def interrupted(self) -> None:
+        """Centre or hub has gone: until the next picture is no usual time."""
+        self._interrupted = True
+
     def _show(self, whole: GlobalTracks, now: float) -> None:
-        where = self.places = places(whole)
+        self._settle(whole)
+        where = self.places = places(whole, self._around)
         rows = np.flatnonzero(where.sound)[:MOST_TRACKS]
         slots = self._slots(whole, rows)
-        ground = (whole.frame if isinstance(whole.frame, Local) else None, isinstance(whole.frame, Local))
-        if ground != self._ground:
-            self._ground = ground
-            self._trail.clear()
         if now - self._marked >= EVERY:
             self._marked = now
             self._trail.append(_Point(slots, where.x[rows], where.y[rows]))
             while sum(len(one.slots) for one in self._trail) > MOST_POINTS:
                 self._trail.popleft()
         self.frame = self._packed(whole, where, rows, slots)
+
+    def _settle(self, whole: GlobalTracks) -> None:
+        """On which ground the picture is: a plane with a name, or the Earth about a longitude, of the first picture."""
+        ground = flat_name(whole.frame)
+        if self.version > 1 and ground == self._ground:
+            return
+        self._trail.clear()
+        if isinstance(whole.frame, Enu):
+            self._around = whole.frame.lon
+        elif ground is None and (there := places(whole)).sound.any():
+            self._around = float(there.x[there.sound][0])
+        elif ground is None:
+            return
+        self._ground = ground
 
     def _slots(self, whole: GlobalTracks, rows: NDArray[np.intp]) -> U32:
         """The slots of these rows; notes their texts, and forgets those of tracks that are gone."""
@@ -140,6 +167,7 @@ class Pictures:
             "step": whole.step,
             "rule": cut(whole.rule),
             "frame": frame_words(whole.frame),
+            "around": self._around,
             "ways": [cut(one) for one in ways],
             "left_out": len(whole.ids) - len(rows),
         }

@@ -1,6 +1,8 @@
 """Where a picture's tracks, and what a source says of its own place and coverage, lie on a map.
 
-A picture in an ENU or ECEF frame is shown by longitude and latitude, degrees; one in a named local frame by x and y, m.
+A picture in an ENU or ECEF frame is shown by longitude and latitude, degrees; one in a named local frame by x and y, m,
+and so is one in an ENU frame where Mercator's map has no room, at the poles. Longitudes go on beyond 180 degrees, so
+that what is near is near on the map on both sides of the antimeridian.
 An ellipse is that of one standard deviation in the horizontal plane at the track: half axes in m, and the angle of the
 long one, rad, anticlockwise from east (from x). What a density says not at all (WIRE.md, State spaces) is left out.
 """
@@ -18,11 +20,15 @@ from fusion_service.geodesy import ecef_to_geodetic, enu_to_geodetic, level_axes
 from schemas import Disk, Ecef, Enu, Frame, GlobalTracks, Local, Polygon, Sector, SensorInfo
 from schemas.spaces import UNKNOWN_SIGMA
 
-__all__ = ["Places", "frame_words", "places", "source_place"]
+__all__ = ["Places", "flat_name", "frame_words", "near", "places", "source_place"]
 
 ARC = 48
 """Corners of the outline of a disk."""
 EARTH = 6378137.0
+EDGE = 85.05
+"""Degrees of latitude at which Mercator's map ends."""
+POLAR = 84.0
+"""From which latitude on a picture is shown by its own east and north."""
 
 
 class Places(NamedTuple):
@@ -41,8 +47,17 @@ class Places(NamedTuple):
     sound: Bools
 
 
-def places(picture: GlobalTracks) -> Places:
-    """Where the tracks of a picture are."""
+def flat_name(frame: Frame) -> str | None:
+    """The name of a frame that is shown by its own x and y; None for one that is shown on the Earth."""
+    if isinstance(frame, Local):
+        return frame.name
+    if isinstance(frame, Enu) and abs(frame.lat) > POLAR:
+        return f"east and north of {frame.lat:.6g}, {frame.lon:.6g}"
+    return None
+
+
+def places(picture: GlobalTracks, around: float = 0.0) -> Places:
+    """Where the tracks of a picture are; around: the longitude about which they lie, degrees."""
     means, covariances = moments(picture.means, picture.covariances, picture.weights, picture.counts)
     space, count = picture.space, len(picture.ids)
     place, spread = _part(means, covariances, space, ("x", "y", "z"))
@@ -54,11 +69,13 @@ def places(picture: GlobalTracks) -> Places:
     still = ~((speed_spread[:, 0, 0] < limit) & (speed_spread[:, 1, 1] < limit)) | ("vx" not in space)
     speed[speed_spread[:, 2, 2] >= limit, 2] = 0.0
     with np.errstate(all="ignore"):
-        if isinstance(picture.frame, Local):
+        if flat_name(picture.frame) is not None or isinstance(picture.frame, Local):
             x, y, height = place.T
             axes = np.broadcast_to(np.eye(3)[:2], (count, 2, 3))
         else:
             x, y, height, axes = _on_earth(place, unknown_z, picture.frame)
+            x = near(x, around)
+            y = np.where(np.abs(y) <= EDGE, y, np.nan)
         flat = axes @ spread @ axes.transpose(0, 2, 1)
         velocity = np.einsum("tij,tj->ti", axes, speed)
         major, minor, turn = _ellipse(flat)
@@ -66,6 +83,11 @@ def places(picture: GlobalTracks) -> Places:
     height = np.where(unknown_z, np.nan, height)
     sound = np.isfinite(x) & np.isfinite(y) & np.isfinite(major) & np.isfinite(minor)
     return Places(x, y, height, major, minor, turn, velocity[:, 0], velocity[:, 1], sound)
+
+
+def near(longitude: Floats, around: float) -> Floats:
+    """The same longitudes, as those that are nearest to `around`, degrees."""
+    return longitude - 360.0 * np.rint((longitude - around) / 360.0)
 
 
 def _part(means: Floats, covariances: Floats, space: tuple[str, ...], names: tuple[str, ...]) -> tuple[Floats, Floats]:
@@ -104,16 +126,16 @@ def _ellipse(flat: Floats) -> tuple[Floats, Floats, Floats]:
 
 def frame_words(frame: Frame) -> dict[str, Any]:
     """A frame for the page: kind, and its name or origin."""
-    if isinstance(frame, Local):
-        return {"kind": "local", "name": frame.name[:64]}
-    if isinstance(frame, Ecef):
+    if (name := flat_name(frame)) is not None:
+        return {"kind": "local", "name": name[:64]}
+    if not isinstance(frame, Enu):
         return {"kind": "ecef"}
     return {"kind": "enu", "lat": frame.lat, "lon": frame.lon}
 
 
 def source_place(info: SensorInfo) -> dict[str, Any] | None:
-    """Place and outline of the coverage of a source, as lists of pairs; local: the name of its frame, where it is none
-    on the Earth. None where it is nowhere."""
+    """Place and outline of the coverage of a source, as lists of pairs; local: the name of its frame, where that is not
+    shown on the Earth. None where it is nowhere."""
     frame: Enu | Ecef | Local = info.frame
     centre = info.position
     if isinstance(frame, Ecef):
@@ -124,11 +146,12 @@ def source_place(info: SensorInfo) -> dict[str, Any] | None:
     outline = _outline(info, centre)
     points = np.array([centre[:2], *outline], dtype=np.float64)
     said: dict[str, Any] = {}
-    if isinstance(frame, Local):
-        said["local"] = frame.name
+    name = flat_name(frame)
+    if name is not None or isinstance(frame, Local):
+        said["local"] = (name or "")[:64]
     else:
         lat, lon, _ = enu_to_geodetic(points[:, 0], points[:, 1], np.full(len(points), centre[2]), frame)
-        points = np.stack([lon, lat], axis=1)
+        points = np.stack([near(lon, float(lon[0])), lat], axis=1)
     if not np.isfinite(points).all():
         return None
     return {**said, "place": points[0].tolist(), "outline": points[1:].tolist()}

@@ -97,12 +97,15 @@ class State:
                     said = "is on the bus" if there else "has left the bus"
                     centre.histories.say(self._wall() // 10**6, "console", f"centre {name} {said}", not there)
                 centre.alive = there
+                if not there:
+                    centre.pictures.interrupted()
 
     def hub(self, there: bool, trouble: str = "") -> None:
         """Whether the hub is there, and what is wrong if not."""
         with self._lock:
             if there != self._hub:
                 for centre in self._centres.values():
+                    centre.pictures.interrupted()
                     said = "the hub is back" if there else "the hub is away"
                     centre.histories.say(self._wall() // 10**6, "console", said, not there)
             self._hub, self._trouble = there, trouble[:200]

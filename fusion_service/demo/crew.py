@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from fusion_service.errors import FusionError
+from fusion_service.lifeline import Lifeline
 
 __all__ = ["Crew", "DemoError", "client_arguments", "free_endpoint", "record_arguments"]
 
@@ -23,11 +24,13 @@ class DemoError(FusionError):
 
 
 class Crew:
-    """The processes of a demo, each with a log file in `folder`. Leaving the context ends them all."""
+    """The processes of a demo, each with a log file in `folder`. Leaving the context ends them all, as the end of this
+    process does, kill -9 too."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._processes: dict[str, subprocess.Popen[bytes]] = {}
+        self._lifeline = Lifeline()
 
     def start(self, name: str, arguments: Sequence[str]) -> None:
         """`python -m ...` in a group of its own, so that Ctrl-C at the terminal reaches only the demo."""
@@ -38,6 +41,7 @@ class Crew:
                 stderr=subprocess.STDOUT,
                 stdin=subprocess.DEVNULL,
                 start_new_session=True,
+                **self._lifeline.options,
             )
 
     def check(self, *allowed: str) -> None:
@@ -79,6 +83,7 @@ class Crew:
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+        self._lifeline.close()
 
 
 def free_endpoint() -> str:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable
+from collections.abc import Collection, Container, Iterable
 
 from fusion_service.hints.words import key_finding, near
 from schemas import parse_key
 
-__all__ = ["beside", "realm_of"]
+__all__ = ["beside", "no_centre", "realm_of"]
+
+MOST = 5
+"""Names that are told."""
 
 
 def realm_of(key: str) -> str:
@@ -16,6 +19,15 @@ def realm_of(key: str) -> str:
         return parse_key(key).realm
     except ValueError:
         return ""
+
+
+def no_centre(name: str, there: Collection[str]) -> str:
+    """That no centre of this name answers, and which are there."""
+    others = sorted(set(there) - {name})
+    if not others:
+        return f"no centre named {name} answers: is `fusion-service run` there, under this name?"
+    names = ", ".join(others[:MOST]) + (f" and {len(others) - MOST} more" if len(others) > MOST else "")
+    return f"no centre named {name} answers, but {names}: give --centre {others[0]}"
 
 
 def beside(keys: Iterable[str], realm: str, served: Container[str] = (), sure: bool = False) -> list[str]:

@@ -24,6 +24,8 @@ OLD = 3.5
 """Seconds after which a status should have been followed by another."""
 RECENT = 60.0
 """Seconds for which a refusal counts as one of now."""
+MENDED = 10.0
+"""Seconds for which a source is taken without another refusal, after which it is well, and was wrong before."""
 MOST_LINES = 200
 STATES = {
     "gone": "its liveliness token is no more",
@@ -175,7 +177,7 @@ def _row(name: str, said: Mapping[str, Any], shared: int | None, now: int, ignor
     tracks = tracks if isinstance(tracks, int) and not isinstance(tracks, bool) else None
     last, refused = said.get("last_refusal"), said.get("refused")
     recent = isinstance(last, Mapping) and isinstance(when := last.get("time"), int) and (now - when) / 1e9 < RECENT
-    newest = last if recent and isinstance(last, Mapping) else {}
+    newest = last if recent and isinstance(last, Mapping) and not _mended(last) else {}
     state = _state(said, newest)
     faults = _faults(said, state, newest)
     counts = [one for one in refused.values() if isinstance(one, int)] if isinstance(refused, Mapping) else []
@@ -193,13 +195,19 @@ def _row(name: str, said: Mapping[str, Any], shared: int | None, now: int, ignor
         round(_number(said, "gaps") or 0),
         str(newest.get("reason", "")),
         tuple(faults),
-        tuple(one for one in _more(said, state) if not any(one in fault for fault in faults)),
+        tuple(one for one in _more(said, state, now if recent else None) if not any(one in fault for fault in faults)),
         ignored,
     )
 
 
+def _mended(last: Mapping[str, Any]) -> bool:
+    """Whether a source has been well since its last refusal, for long enough to say so."""
+    well, when = last.get("well"), last.get("time")
+    return isinstance(well, int) and isinstance(when, int) and (well - when) / 1e9 >= MENDED
+
+
 def _state(said: Mapping[str, Any], last: Mapping[str, Any]) -> str:
-    """Which of `STATES` a source is in. last: its last refusal, if that was lately."""
+    """Which of `STATES` a source is in. last: its last refusal, if that was lately and it is not well since."""
     if said.get("alive") is False:
         return "gone"
     if said.get("muted") is True:
@@ -214,12 +222,12 @@ def _state(said: Mapping[str, Any], last: Mapping[str, Any]) -> str:
 
 
 def _faults(said: Mapping[str, Any], state: str, last: Mapping[str, Any]) -> list[str]:
-    """What is wrong with a source. last: its last refusal, if that was lately."""
+    """What is wrong with a source. last: its last refusal, if that was lately and it is not well since."""
     found = []
     if state == "gone":
         found.append("it is gone: its liveliness token is no more")
     if last and last.get("reason") not in BENIGN:
-        found.append(f"refused ({last.get('reason')}, {_count(last)} times): {last.get('said')}")
+        found.append(f"refused ({last.get('reason')}, {_times(last)}): {last.get('said')}")
     if state == "silent" or (state == "resting" and said.get("messages")):
         found.append("it is silent: its newest tracks are stale" + "; it rests" * (state == "resting"))
     elif state == "unheard":
@@ -234,12 +242,20 @@ def _faults(said: Mapping[str, Any], state: str, last: Mapping[str, Any]) -> lis
     return [*found, *(str(one) for one in (alarms if isinstance(alarms, (list, tuple)) else ()))]
 
 
-def _more(said: Mapping[str, Any], state: str) -> list[str]:
-    """What else is known of a source that a person should read."""
+def _more(said: Mapping[str, Any], state: str, now: int | None) -> list[str]:
+    """What else is known of a source that a person should read. now: ns, where its last refusal was lately."""
     last, lines = said.get("last_refusal"), []
     if isinstance(last, Mapping) and last.get("reason") in BENIGN:
-        lines.append(f"refused ({last.get('reason')}, {_count(last)} times): {last.get('said')}")
+        lines.append(f"refused ({last.get('reason')}, {_times(last)}): {last.get('said')}")
+    elif now is not None and isinstance(last, Mapping) and _mended(last):
+        before = f"refused until {span((now - last['time']) / 1e9)} ago ({last.get('reason')}, {_times(last)})"
+        lines.append(f"well since; {before}: {last.get('said')}")
     return [*([STATES[state]] if state in ("resting", "muted") else []), *lines, *source_health(said)]
+
+
+def _times(last: Mapping[str, Any]) -> str:
+    count = _count(last)
+    return "once" if count == 1 else f"{count} times"
 
 
 def _count(last: Mapping[str, Any]) -> int:

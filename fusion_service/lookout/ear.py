@@ -144,6 +144,10 @@ class Ear:
         """Whether the token of a centre stands; None where that is not known."""
         return self.alive.get(global_key(name, "alive", self.realm))
 
+    def centres_there(self) -> list[str]:
+        """The centres whose tokens stand."""
+        return [key.split("/")[-2] for key, up in list(self.alive.items()) if up and "/v1/global/" in key]
+
     def _note(self, key: str, alive: bool) -> None:
         if key in self.alive or len(self.alive) < MOST_KEYS:
             self.alive[key] = alive

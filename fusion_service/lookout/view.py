@@ -6,6 +6,7 @@ import time
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+from fusion_service.hints.elsewhere import no_centre
 from fusion_service.hints.health import Health, health_of
 from fusion_service.hints.times import span
 from fusion_service.lookout.ear import Ear
@@ -68,8 +69,8 @@ def view_of(ear: Ear, now: int, *, centre: str = "", ignored: Sequence[str] = ()
     if not hub:
         general.append("the hub is away: what is shown is as it was")
     elif not seen:
-        who = f"no centre named {centre}" if centre else f"no centre of the realm {ear.realm}"
-        general.append(f"{who} answers: is `fusion-service run` there, under this name?")
+        who = f"no centre of the realm {ear.realm} answers: is `fusion-service run` there?"
+        general.append(no_centre(centre, ear.centres_there()) if centre else who)
     for one in seen if hub else []:
         if one.gone:
             general.append(f"centre {one.name} is gone for {span(one.age)}: its liveliness token is no more")

@@ -43,6 +43,8 @@ class Finding:
         return self.state in ("broken", "doubtful") or bool(self.doubts)
 
     def __str__(self) -> str:
+        if self.state == "not sealed" and not self.messages:
+            return "; ".join(["nothing has been recorded in it yet", *[self.doubts] * bool(self.doubts)])
         if self.state == "not sealed":
             text = "not sealed: recorded by a version without seals, or by another program"
             return "; ".join([text, *[self.doubts] * bool(self.doubts)])

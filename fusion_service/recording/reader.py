@@ -30,7 +30,7 @@ import numpy as np
 from fusion_service.errors import ReviewError
 from fusion_service.recording.columns import import_rerun
 from fusion_service.recording.parts import number_of, parts
-from fusion_service.recording.salvage import HEADER, salvage, whole_part
+from fusion_service.recording.salvage import HEADER, NOTHING_YET, nothing_yet, salvage, whole_part
 from schemas import Message, MessageError, decode
 
 __all__ = ["RawMessage", "Watch", "has_index", "messages", "read", "read_file", "recording_id", "repair", "stored"]
@@ -241,6 +241,8 @@ def _open(path: Path, named: Path | None = None) -> Any:
         except RuntimeError:
             if whole_part(path)[0] > HEADER and not named:
                 raise
+    if nothing_yet(named or path):
+        raise ReviewError(f"{named or path}: {NOTHING_YET}")
     raise ReviewError(f"{named or path} is not a recording, or nothing of it can be read")
 
 

@@ -18,8 +18,9 @@ from typing import NamedTuple
 
 from fusion_service.recording.columns import import_rerun
 
-__all__ = ["HEADER", "MAGIC", "RECORD", "Lost", "decodes", "salvage", "whole_part"]
+__all__ = ["HEADER", "MAGIC", "NOTHING_YET", "RECORD", "Lost", "decodes", "nothing_yet", "salvage", "whole_part"]
 
+NOTHING_YET = "nothing has been recorded in it yet: its recorder has just begun, or ended at once"
 MAGIC, HEADER, RECORD = b"RRF2", 12, struct.Struct("<QQ")
 END, STORE, CHUNK, ACTIVATION = 0, 1, 2, 3
 TRAILER = 32
@@ -77,6 +78,14 @@ def whole_part(path: Path) -> tuple[int, bool]:
         if _closes(data, at, size):
             return size, False
         return at, at < size and _next(data, at + 1, size) < size
+
+
+def nothing_yet(path: Path) -> bool:
+    """Whether a file is the very beginning of a recording, of which no record is whole: its recorder has just begun, or
+    was ended at once."""
+    with path.open("rb") as file:
+        head = file.read(len(MAGIC))
+    return MAGIC.startswith(head) and whole_part(path) in ((0, False), (HEADER, False))
 
 
 def salvage(path: Path, target: Path) -> Lost:

@@ -19,6 +19,7 @@ from fusion_service.recording.chain import DIGEST, Link, Seal, Statement, digest
 from fusion_service.recording.finding import Finding, Gathered, at, span
 from fusion_service.recording.parts import number_of, parts
 from fusion_service.recording.reader import RawMessage, read_file
+from fusion_service.recording.salvage import NOTHING_YET, nothing_yet
 from fusion_service.recording.sealing import CHAIN, SIGNER, seals_of, signers_of
 from fusion_service.recording.signing import Authority, Identity, fingerprint, import_cryptography
 
@@ -39,16 +40,22 @@ def verify(path: Path, authority: Authority | None = None, stopped: Callable[[],
     there = parts(path)
     if not there:
         raise FileNotFoundError(f"no recordings 0001.rrd, ... in {path}")
-    unread = 0
+    unread, begun = 0, 0
     for one in there:
         try:
             _check(one, mission, f" of part {number_of(one)}", stopped)
         except FileNotFoundError:  # its recorder has deleted it meanwhile
             continue
         except ReviewError:  # torn at its beginning; if it held what was sealed, the chain says so
-            mission.found.note(f"part {number_of(one)} cannot be read")
-            unread += 1
-    if unread == len(there):
+            if nothing_yet(one):
+                mission.found.note(f"part {number_of(one)} has just begun")
+                begun += 1
+            else:
+                mission.found.note(f"part {number_of(one)} cannot be read")
+                unread += 1
+    if begun == len(there):
+        raise ReviewError(f"{path}: {NOTHING_YET}")
+    if unread + begun == len(there):
         raise ReviewError(f"{path}: none of its parts can be read")
     return mission.told()
 

@@ -106,9 +106,14 @@ class Complaints:
             self._note(name, found, received)
 
     def stepped(self, journal: StepLog) -> None:
-        """A step was made: tell what it refused."""
+        """A step was made: tell what it refused, and note who is taken again."""
         self._step = journal.time
         now, explained = time.time_ns(), 0
+        for name in {one.source for one in journal.taken} - {
+            one.source for one in (*journal.refused, *journal.dropped)
+        }:
+            if (last := self._last.get(name)) is not None:
+                last["well"] = now
         for entry in (*journal.refused, *journal.dropped):
             if entry.reason == "overtaken":  # the service is behind, which it says itself
                 continue

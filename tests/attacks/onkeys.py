@@ -307,8 +307,14 @@ ON_KEYS = (
     KeyAttack(
         "a viewer reading sources", "viewer-wall", listen(f"{V1}/local/*/tracks"), "Declare Subscriber local/*/tracks"
     ),
+    KeyAttack("a viewer reading all of a source", "viewer-wall", listen(f"{V1}/local/r1/**"), "Declare Subscriber r1"),
+    KeyAttack(
+        "a gateway reading infos", "gateway-gate", listen(f"{V1}/local/*/info"), "Declare Subscriber local/*/info"
+    ),
+    KeyAttack("a viewer placing a sensor", "viewer-wall", put("local/r1/info"), "Put local/r1/info"),
     KeyAttack("asking the caches", "source-evil", ask("**/@adv/**"), "Query @adv"),
     KeyAttack("a viewer asking the caches", "viewer-wall", ask("local/**/@adv/**"), "Query @adv"),
+    KeyAttack("a viewer asking caches of tracks", "viewer-wall", ask("local/*/tracks/@adv/**"), "Query tracks/@adv"),
     KeyAttack("asking for the picture", "source-evil", ask("global/*/picture"), "Query global/*/picture"),
     KeyAttack("seeing who is there", "source-evil", look_for_tokens, "Declare Liveliness Subscriber **"),
     KeyAttack("too large", "source-evil", flood, ""),

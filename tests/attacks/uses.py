@@ -6,6 +6,8 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import ExitStack
+from functools import partial
 
 import msgpack
 
@@ -44,6 +46,22 @@ def viewer(lab: Lab) -> bool:
         pictures = [schemas.decode(data) for _, data in asked]
         whole = len(pictures) == 2 and all(isinstance(one, schemas.GlobalTracks) for one in pictures)
         return whole and lab.wait(lambda: bool(heard), 3.0)
+
+
+def _note(keys: list[str], key: str, data: bytes) -> None:
+    keys.append(key)
+
+
+def sensors_seen(lab: Lab) -> bool:
+    """A viewer and an operator that join late hear what a radar has said of itself, and nothing else of it."""
+    heard: dict[str, list[str]] = {"viewer-wall": [], "operator-bob": []}
+    with ExitStack() as stack:
+        for party, keys in heard.items():
+            bus = stack.enter_context(open_bus([lab.endpoint], wait=10.0, security=lab.security(party)))
+            bus.subscribe(f"{V1}/local/*/info", partial(_note, keys))
+        return lab.wait(
+            lambda: lab.report() and all(set(keys) == {f"{V1}/local/r1/info"} for keys in heard.values()), 3
+        )
 
 
 def recorder_seen(lab: Lab) -> bool:
@@ -116,6 +134,7 @@ USES: dict[str, Callable[[Lab], bool]] = {
     "a source is fused": source,
     "a late recorder gets what is cached": late_recorder,
     "a viewer reads the picture": viewer,
+    "viewers see where sensors stand": sensors_seen,
     "a viewer sees the recorder": recorder_seen,
     "an operator's order": operator,
     "a gateway publishes and reads": gateway,

@@ -89,9 +89,28 @@ def test_parties_are_added_renewed_and_removed_later(tmp_path: Path, capsys: pyt
     ):
         assert command("keys", folder, *wrong) == 2
         assert why in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        command("keys", tmp_path / "nothing", "--source", "r1", "--days", "1e9")
+    assert "for which the authority itself holds" in capsys.readouterr().err
     assert command("keys", tmp_path / "nothing") == 2
     assert "no keys there" in capsys.readouterr().err
     assert not (tmp_path / "nothing").exists()
+
+
+def test_an_authority_that_is_kept_elsewhere_is_not_replaced(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "keys"
+    assert command("keys", folder, "--source", "r1") == 0
+    (folder / "authority" / "ca.key").unlink()
+    kept = {path: path.read_bytes() for path in folder.glob("*/*")}
+    capsys.readouterr()
+    for more in (["--source", "r3"], ["--renew", "source:r1"], ["--remove", "source:r1"], ["--at", "10.0.0.1"]):
+        assert command("keys", folder, *more) == 2
+        assert "but no authority/ca.key, which alone can add" in capsys.readouterr().err
+    assert command("keys", folder) == 0
+    assert "source r1" in capsys.readouterr().out
+    assert {path: path.read_bytes() for path in folder.glob("*/*")} == kept
 
 
 def test_a_file_that_is_no_good_is_refused_in_one_line(keys: Path, tmp_path: Path) -> None:

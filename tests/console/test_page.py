@@ -14,6 +14,7 @@ import pytest
 import schemas
 from fusion_service.bus import Publisher
 from schemas import GlobalTracks, Status, StepLog
+from sensor_clients.publisher import TrackPublisher
 from tests.console.scenes import FIRST, picture, status, step_log
 from tests.helpers.browser import CHROMIUM, Browser, Page
 from tests.helpers.processes import Hub, Program, eventually, free_endpoint
@@ -31,6 +32,14 @@ WIDE = """(() => {
   const shown = [...document.querySelectorAll('main *')].filter((one) => one.checkVisibility() && !one.closest('#map'));
   const right = shown.map((one) => one.getBoundingClientRect().right);
   return Math.max(document.documentElement.scrollWidth, ...right);
+})()"""
+IS_FULL = """(() => {
+  const [x, y] = fusionConsole.sensor('buoy');
+  const map = document.querySelector('#map').getBoundingClientRect();
+  const canvas = document.querySelector('canvas.drawn:not([hidden])');
+  const box = canvas.getBoundingClientRect();
+  const [left, top] = [map.x + x - box.x, map.y + y - box.y].map(Math.round);
+  return canvas.getContext('2d').getImageData(left - 2, top + 1, 1, 1).data[3] > 200;
 })()"""
 IS_DRAWN = """(() => {
   const [x, y] = fusionConsole.at(%s);
@@ -220,7 +229,7 @@ def test_hostile_names_are_text(room: Room, page: Page) -> None:
     messages: dict[str, GlobalTracks | StepLog | Status] = {
         "tracks": picture(3, name="evil", identity=texts, callsign=texts, kind=texts, rule=HOSTILE),
         "log": step_log([], source="evil", events=events),
-        "status": status(sources={HOSTILE: said}, name="evil"),
+        "status": status(sources={HOSTILE: said, "W" * 200: said}, name="evil"),
     }
     keys = [schemas.global_key("evil", what) for what in messages]
     publishers: list[Publisher] = [bus.publisher(key) for key in keys]
@@ -238,6 +247,11 @@ def test_hostile_names_are_text(room: Room, page: Page) -> None:
         for tab in ("sources", "alarms", "log"):
             page.js(f"document.querySelector('#tab-{tab}').click()")
             page.until(f"document.querySelector('#{tab}').innerText.includes('<img src=x')")
+        page.size(390, 844)
+        page.js("document.querySelector('#tab-sources').click()")
+        tall = "[...document.querySelectorAll('#sources .state, #sources .head button')].map((one) => one.offsetHeight)"
+        page.until(f"Math.max(...{tall}) < 45", 20)
+        page.size(1280, 800)
         assert page.js("[document.querySelectorAll('img').length, document.title]") == [0, "Fusion console · fusion"]
         page.js(PICK % ("#centre", "centre"))
         page.until("document.querySelectorAll('#map').length && document.querySelector('#map').dataset.tracks === '2'")
@@ -245,6 +259,43 @@ def test_hostile_names_are_text(room: Room, page: Page) -> None:
     finally:
         for publisher in publishers:
             publisher.close()
+
+
+def test_the_map_goes_on_over_the_date_line_and_shows_the_place_where_there_is_nothing(room: Room, page: Page) -> None:
+    """Tracks on both sides of 180 degrees are near each other; without any, the origin of the frame is shown."""
+    bus, fiji = room.scene.bus, schemas.Enu(-17.0, 179.999)
+    tracks, token = (
+        bus.publisher(schemas.global_key("fiji", "tracks")),
+        bus.announce(schemas.global_key("fiji", "alive")),
+    )
+    health, stack = bus.publisher(schemas.global_key("fiji", "status")), ExitStack()
+    seen = "document.querySelector('#map').dataset.tracks"
+    try:
+        tracks.put(schemas.encode(picture(3, name="fiji", frame=fiji)))
+        page.until("[...document.querySelectorAll('#centre option')].some((one) => one.value === 'fiji')")
+        page.js(PICK % ("#centre", "fiji"))
+        page.until(f"{seen} === '3'")
+        page.js("document.querySelector('#fit').click()")
+        left, right = (page.until(f"fusionConsole.at('{FIRST + k}')")[0] for k in (0, 2))
+        assert left < right < left + 2000, "100 m lie between two of them"
+        assert page.text("#scale .say").endswith(" m")
+        tracks.put(schemas.encode(picture(0, step=2, name="fiji", frame=fiji)))
+        page.until(f"{seen} === '0'")
+        page.js("document.querySelector('#fit').click()")
+        page.until("/^\\d+ m$|^[1-9]\\d?\\.\\d km$/.test(document.querySelector('#scale .say').innerText)")
+        buoy = stack.enter_context(TrackPublisher("buoy", connect=room.scene.endpoint, wait=20.0))
+        buoy.info(frame=fiji, position=(2000.0, 1000.0, 5.0), period=1.0, motion=schemas.Motion("cv", q=1.0))
+        for there in (True, False):  # a full sign, and a hollow one when it has gone
+            said = status(sources={"buoy": {"alive": there, "messages": 1}}, name="fiji")
+            health.put(schemas.encode(said))
+            page.until(f"({IS_FULL}) === {json.dumps(there)}")
+    finally:
+        stack.close()
+        health.close()
+        tracks.close()
+        token.close()
+        page.js(PICK % ("#centre", "centre"))
+    assert list(page.complaints) == []
 
 
 def test_the_policy_lets_no_text_become_markup_or_script(page: Page) -> None:

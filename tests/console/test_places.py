@@ -6,7 +6,8 @@ import numpy as np
 import pymap3d
 import pytest
 
-from fusion_service.console.places import places, source_place
+from fusion_service.console.pictures import Pictures
+from fusion_service.console.places import frame_words, places, source_place
 from schemas import Disk, Ecef, Enu, Frame, Local, Motion, Polygon, Sector, SensorInfo
 from tests.console.scenes import HARBOUR, picture
 
@@ -115,3 +116,43 @@ def test_places_of_sources_in_all_frames() -> None:
     far = source_place(info(HARBOUR, (0.0, 0.0, 0.0), Disk(1e8)))
     assert far is not None
     assert far["outline"] == []
+
+
+def test_what_is_near_is_near_on_both_sides_of_the_antimeridian() -> None:
+    fiji = Enu(-17.0, 179.98)
+    lat, lon, _ = pymap3d.enu2geodetic(EAST, NORTH, 0.0, fiji.lat, fiji.lon, 0.0)
+    assert lon.min() < 0 < lon.max()
+    x, y, z = pymap3d.geodetic2ecef(lat, lon, np.zeros(3))
+    state = np.stack([x, y, z, *np.zeros((3, 3))], axis=1)
+    space, covariances = ("x", "y", "z", "vx", "vy", "vz"), np.tile(np.eye(6), (3, 1, 1))
+    pictures = Pictures()
+    for step, shown in enumerate(
+        (
+            picture(3, means=spread(fiji), frame=fiji),
+            picture(3, step=2, frame=Ecef(), space=space, means=state, covariances=covariances),
+            picture(3, step=3, means=spread(fiji), frame=Enu(-17.0, -179.99)),
+        )
+    ):
+        assert pictures.take(shown, float(step))
+        assert pictures.places is not None
+        assert np.ptp(pictures.places.x) < 1.0
+        assert np.abs(pictures.places.x - fiji.lon).max() < 1.0
+        if step < 2:
+            np.testing.assert_allclose(np.cos(np.radians(pictures.places.x - lon)), 1.0, atol=1e-12)
+    outline = source_place(info(Enu(-17.0, -179.99), (0.0, 0.0, 0.0), Disk(8000.0)))
+    assert outline is not None
+    assert np.ptp([corner[0] for corner in outline["outline"]]) < 1.0
+
+
+def test_at_a_pole_the_picture_is_flat() -> None:
+    pole = Enu(-89.99, 12.0)
+    found = places(picture(3, means=spread(pole), frame=pole))
+    np.testing.assert_array_equal(np.stack([found.x, found.y]), np.stack([EAST, NORTH]))
+    words = frame_words(pole)
+    assert words == {"kind": "local", "name": "east and north of -89.99, 12"}
+    beside = source_place(info(pole, (10.0, 20.0, 0.0), None))
+    assert beside == {"local": words["name"], "place": [10.0, 20.0], "outline": []}
+    x, y, z = pymap3d.geodetic2ecef(89.9, 0.0, 0.0)
+    far = np.array([[x, y, z]])
+    top = places(picture(1, frame=Ecef(), space=("x", "y", "z"), means=far, covariances=np.eye(3)[None]))
+    assert not top.sound.any(), "a map by Mercator has no room for it"

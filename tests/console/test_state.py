@@ -138,7 +138,7 @@ def test_a_track_is_explained(clocked: Clocked) -> None:
     assert [(one["source"], one["influence"]) for one in told["members"]] == [("r2", 0.75), ("r1", 0.25)]
     assert told["members"][1] == {"source": "r1", "epoch": str(2**63), "id": "0", "influence": 0.25, "d2": 24.0}
     assert [one[1] for one in told["history"]][:3] == ["born", "r1 0 linked, d2 2.5", "took in 10, d2 1.0"]
-    assert told["history"][-1][1] == "3 was split off it"
+    assert told["history"][-1][1] == "split off it: 3, d2 3.0"
     assert told["ellipse"][:2] == pytest.approx([20.0, 10.0], rel=1e-4)
     clocked.state.take(
         picture(2, 5, ids=np.array([FIRST + 1, FIRST + 2], dtype=np.uint64), ended=((FIRST, "lost", FIRST + 1),))
@@ -183,7 +183,7 @@ def test_the_log_tells_decisions_events_refusals_and_orders(clocked: Clocked) ->
     clocked.state.take(step_log([*many, (EXCHANGED, FIRST, FIRST + 1, 1.0)], events=events, refused=refused))
     lines = clocked.news(Seen("centre"))[1]["log"]["lines"]
     told = [one["text"] for one in lines]
-    assert told[:2] == ["r2: 1 messages refused (late)", "r2: 3 tracks refused (late)"]
+    assert told[:2] == ["r2: 1 message refused (late)", "r2: 3 tracks refused (late)"]
     assert told[2:8] == [
         "r1 is on the bus", "the service began, without a checkpoint", "r1: alarm: clock", "never heard of (x 1)",
         "4 steps were skipped: more comes than can be worked off",
@@ -232,3 +232,30 @@ def test_centres_are_bounded_and_garbage_harms_nothing(clocked: Clocked) -> None
     _, news = clocked.news(Seen("c0"))
     assert all(len(one[4]) <= 80 for one in news["texts"]["tracks"])
     assert clocked.news(Seen("nobody")) == (Seen("nobody"), {})
+
+
+def test_pictures_that_come_several_at_a_time_are_not_stale_between(clocked: Clocked) -> None:
+    """As by the messages' own time: ten steps at once, every ten seconds; and an outage is no usual time."""
+
+    def come(step: int) -> None:
+        clocked.state.take(picture(1, step))
+        clocked.now += 0.01
+
+    step = 0
+    for burst in range(3):
+        for _ in range(10):
+            come(step := step + 1)
+        clocked.now += 9.9
+        assert clocked.state.pulse("centre")["stale"] is (burst == 0)
+    for _ in range(150):
+        come(step := step + 1)
+        clocked.now += 1
+    clocked.state.hub(False)
+    clocked.now += 300
+    clocked.state.hub(True)
+    come(step := step + 1)
+    clocked.state.alive("centre", True)
+    clocked.state.alive("centre", False)
+    clocked.now += 300
+    come(step + 1)
+    assert clocked.state.pulse("centre")["patience"] == pytest.approx(4 * 1.01)

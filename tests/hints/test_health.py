@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from fusion_service.hints.health import health_of
+from fusion_service.hints.health import Row, health_of
 from schemas import Status
 
 NOW = 1_790_000_000 * 10**9
@@ -49,6 +49,22 @@ def test_what_is_old_or_harmless_is_not_wrong() -> None:
     assert wrong(last_refusal={"reason": "late", "count": 3, "time": NOW - 10**12, "said": "mend it"}) == []
     assert wrong(last_refusal={"reason": "repeat", "count": 3, "time": NOW, "said": "mend it"}) == []
     assert wrong(last_refusal="nonsense", doubts=5, alarms="x", refused=[]) == []
+
+
+def test_a_source_that_was_mended_is_well_and_was_wrong() -> None:
+    def row(now: int, **more: Any) -> Row:
+        last = {"reason": "late", "count": 3, "time": NOW - 20 * 10**9, "said": "mend it", **more}
+        source = {**STATUS.sources["a"], "last_refusal": last}
+        (found,) = health_of(replace(STATUS, sources={"a": source}), None, now).rows
+        return found
+
+    for more in ({}, {"well": NOW - 15 * 10**9}, {"well": NOW - 21 * 10**9}, {"well": "x"}):
+        assert row(NOW, **more).faults == ("refused (late, 3 times): mend it",)
+    mended = row(NOW, well=NOW - 10**9)
+    assert (mended.faults, mended.state, mended.reason) == ((), "there", "")
+    assert mended.more == ("well since; refused until 20 s ago (late, 3 times): mend it",)
+    assert row(NOW, well=NOW, count=1).more == ("well since; refused until 20 s ago (late, once): mend it",)
+    assert row(NOW + 41 * 10**9, well=NOW).more == ()
 
 
 def test_a_centre_that_is_held_up_or_behind_is_wrong() -> None:

@@ -56,7 +56,13 @@ def test_a_centre_that_is_gone_and_a_hub_that_is_away() -> None:
     assert one.gone
     assert "centre centre is gone for 60 s: its liveliness token is no more" in view_of(ear, NOW).general
     assert view_of(ear, NOW, hub=False).general == ["the hub is away: what is shown is as it was"]
-    assert "no centre named north answers" in view_of(Ear("fusion"), NOW, centre="north").general[0]
+    assert (
+        "no centre named north answers: is `fusion-service run` there"
+        in view_of(Ear("fusion"), NOW, centre="north").general[0]
+    )
+    other = Ear("fusion")
+    other.alive = {schemas.global_key("centre", "alive"): True, schemas.record_key("rec", "alive"): True}
+    assert view_of(other, NOW, centre="north").general[0].endswith("answers, but centre: give --centre centre")
 
 
 def test_sizes_are_short() -> None:

@@ -14,6 +14,7 @@ from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.complaints import MOST_BYTES, MOST_HEARD, MOST_NAMED, MOST_WAITING, Complaints
 from schemas import Status
+from tests.console.scenes import step_log
 from tests.hints.test_tracks import NOW, message
 
 STATUS = Status(
@@ -101,3 +102,17 @@ def test_late_data_that_stay_where_they_came_are_told_of_in_the_log_once(caplog:
         told.told_in(replace(STATUS, notes=(unplaced({"start": 4}),)))
         told.told_in(STATUS)
     assert [record.message for record in caplog.records] == [unplaced({"start": 3})]
+
+
+def test_a_source_that_is_taken_again_is_said_to_be_well() -> None:
+    told, fault = complaints(), error(b"{}")
+    for name in ("mended", "half", "silent"):
+        told.misread(name, b"{}", fault, NOW)
+    entries = {name: schemas.Entry(name, 1, 0, 0, "") for name in ("mended", "half", "new")}
+    refused = (schemas.Entry("half", 1, 1, 5, "late"),)
+    told.stepped(step_log([], taken=tuple(entries.values()), refused=refused))
+    last = {name: said["last_refusal"] for name, said in told.told_in(STATUS).sources.items() if "last_refusal" in said}
+    assert {name: "well" in one for name, one in last.items()} == {"mended": True, "half": False, "silent": False}
+    assert last["mended"]["well"] > last["mended"]["time"]
+    told.misread("mended", b"{}", fault, time.time_ns())
+    assert "well" not in told.told_in(STATUS).sources["mended"]["last_refusal"]

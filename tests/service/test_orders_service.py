@@ -54,6 +54,21 @@ def test_an_operator_orders_lists_and_withdraws(scene: Scene, capsys: pytest.Cap
     assert "PILOT, 12" in out
     assert "anna" in out
     assert order("withdraw", "2")[:2] == (0, "order 4: order 2 (quarantine) stands no more\n")
+    code, _, err = order("list", "--centre", "center")
+    assert (code, err) == (
+        1,
+        "fusion-service order: no centre named center answers, but centre: give --centre centre\n",
+    )
+    for answer in (b"\xc1", b"\x05", msgpack.packb({"orders": [{}]}), msgpack.packb({"orders": [{"number": []}]})):
+
+        def forge(_: bytes | None, said: bytes = answer) -> bytes:
+            return said
+
+        forged = scene.bus.answer(schemas.global_key("forged", "orders"), forge)
+        assert order("list", "--centre", "forged")[::2] == (
+            1, "fusion-service order: the answer in the name of centre forged cannot be read: who is it?\n"
+        )  # fmt: skip
+        forged.close()
     eventually(lambda: scene.seen.feeders(track) == {"r1", "r2"}, 20)
     assert order("delete", "--track", "PILOT", "--why", "test")[0] == 0
     eventually(lambda: track not in scene.seen.pictures[-1].ids)

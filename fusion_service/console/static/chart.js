@@ -6,11 +6,15 @@ import { RADIUS, unit } from "/static/tracks.js";
 
 const NEAR = 14;
 const BAR = 110;
+/** Px that are left free where all is shown: of the tools on the left, and of names of tracks and axes on the right. */
+const [TOOLS, NAMES] = [[112, 36], [64, 60]];
 
 export class Chart {
-  /** tracks: what is drawn; base, picture, mark: the drawings, the lowest first; picked(id or null): by a click. */
-  constructor(tracks, { base, picture, mark }, picked) {
+  /** tracks: what is drawn; base, picture, mark: the drawings, the lowest first; ground(): the pairs of places that are
+   *  shown where there are no tracks; picked(id or null): by a click. */
+  constructor(tracks, { base, picture, mark }, ground, picked) {
     this.tracks = tracks;
+    this.ground = ground;
     this.draw = { base, picture, mark };
     this.picked = picked;
     this.map = null;
@@ -89,15 +93,25 @@ export class Chart {
 
   /** Where a row is on the screen, px in the map. */
   pixel(row) {
+    return this.place([this.tracks.wx[row], this.tracks.wy[row]]);
+  }
+
+  /** Where a place in the map's unit is on the screen. */
+  place([wx, wy]) {
     const { x, y } = this.map.getPixelBounds().min;
     const scale = (this.geo ? 256 : 1) * 2 ** this.map.getZoom();
-    return [this.tracks.wx[row] * scale - x, this.tracks.wy[row] * scale - y];
+    return [wx * scale - x, wy * scale - y];
   }
 
   /** Show all tracks, but for the few that are far from all others. */
   fit() {
     const { picture, count } = this.tracks;
-    if (!this.map || !count) return;
+    if (!this.map) return;
+    if (!count) {
+      const ground = this.ground();
+      if (ground.length) this.look([Math.min, Math.max].map((of) => [1, 0].map((k) => of(...ground.map((one) => one[k])))));
+      return;
+    }
     const span = (column) => {
       const sorted = Float64Array.from(column).sort();
       const out = Math.floor(0.01 * count);
@@ -105,8 +119,13 @@ export class Chart {
     };
     const [left, right] = span(picture.x);
     const [bottom, top] = span(picture.y);
+    this.look([[bottom, left], [top, right]]);
+  }
+
+  /** Show what lies between two corners. */
+  look(corners) {
     this.fitting = true;
-    this.map.fitBounds([[bottom, left], [top, right]], { padding: [36, 36], maxZoom: this.geo ? 16 : 8, animate: false });
+    this.map.fitBounds(corners, { paddingTopLeft: TOOLS, paddingBottomRight: NAMES, maxZoom: this.geo ? 16 : 8, animate: false });
     this.fitting = false;
   }
 

@@ -67,22 +67,25 @@ export function span(s) {
 /** Metres in words. */
 export function metres(m) {
   if (!Number.isFinite(m)) return "?";
+  if (Math.abs(m) >= 1e6) return `${Math.round(m / 1000)} km`;
   if (Math.abs(m) >= 10000) return `${(m / 1000).toPrecision(3)} km`;
   return `${Math.abs(m) < 10 ? m.toFixed(1) : Math.round(m)} m`;
 }
 
 export const figure = (value, digits = 3) => (Number.isFinite(value) ? Number(value.toPrecision(digits)).toString() : "–");
 
+/** The same longitude, from -180 to below 180 degrees. */
+export const within180 = (x) => x - 360 * Math.floor((x + 180) / 360);
+
 /** A place in words: degrees and minutes, or x and y. */
 export function placeWords(geo, x, y) {
   if (!Number.isFinite(x) || !Number.isFinite(y)) return "nowhere";
   if (!geo) return `x ${metres(x)}, y ${metres(y)}`;
   const part = (value, plus, minus) => {
-    const far = Math.abs(value);
-    const whole = Math.floor(far);
-    return `${whole}° ${((far - whole) * 60).toFixed(3)}′ ${value < 0 ? minus : plus}`;
+    const far = Math.round(Math.abs(value) * 60000);
+    return `${Math.floor(far / 60000)}° ${((far % 60000) / 1000).toFixed(3)}′ ${value < 0 ? minus : plus}`;
   };
-  return `${part(y, "N", "S")}, ${part(x, "E", "W")}`;
+  return `${part(y, "N", "S")}, ${part(within180(x), "E", "W")}`;
 }
 
 /** 1, 2 or 5 times a power of ten, not above `most`. */

@@ -4,7 +4,7 @@
 
 import { clean } from "/static/dom.js";
 import { palette } from "/static/palette.js";
-import { unit, world } from "/static/tracks.js";
+import { placed, unit } from "/static/tracks.js";
 
 const TOGETHER = 120;
 const LEAST = 3;
@@ -170,13 +170,13 @@ export const drawChosen = (state) =>
     const { tracks } = state;
     const row = state.chosen === null ? -1 : tracks.row(state.chosen);
     if (row < 0) return;
-    const geo = tracks.geo;
     const [x, y] = [tracks.wx[row] * view.scale - view.left, tracks.wy[row] * view.scale - view.top];
     context.lineCap = "round";
     for (const { source, influence } of state.detail?.id === state.chosen ? (state.detail.members ?? []) : []) {
       const place = state.places[source];
-      if (!place || (place.local === undefined) !== geo) continue;
-      const [wx, wy] = world(geo, ...place.place);
+      const there = place ? placed(tracks, place) : null;
+      if (!there) continue;
+      const [wx, wy] = there(place.place);
       context.strokeStyle = state.colours.get(source) ?? palette.cover;
       context.lineWidth = 1 + 4 * Math.max(0, Math.min(1, influence ?? 0));
       context.beginPath();

@@ -45,7 +45,7 @@ export class Sources {
       pool(wrong, one.wrong.length, () => make("li")).forEach((line, n) => say(line, one.wrong[n]));
       pool(more, one.more.length, () => make("li")).forEach((line, n) => say(line, one.more[n]));
       const last = one.refusal;
-      refusal.hidden = !last || one.wrong.some((fault) => fault.includes(last.said));
+      refusal.hidden = !last || [...one.wrong, ...one.more].some((line) => line.includes(last.said));
       if (last) say(refusal, `Last refusal${Number.isFinite(last.time) ? ` ${clock(last.time)}` : ""} (${last.reason}, ${figure(last.count)} in all): ${last.said}`);
     });
   }

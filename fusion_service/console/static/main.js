@@ -11,20 +11,31 @@ import { Orders } from "/static/orders.js";
 import { followTheme } from "/static/palette.js";
 import { Stream } from "/static/stream.js";
 import { Track } from "/static/track.js";
-import { Tracks } from "/static/tracks.js";
+import { placed, Tracks } from "/static/tracks.js";
 
 const state = {
-  tracks: new Tracks(), places: {}, colours: new Map(), chosen: null, detail: null, health: null, pulse: null, heard: 0,
+  tracks: new Tracks(), places: {}, colours: new Map(), states: new Map(), chosen: null, detail: null, health: null, pulse: null, heard: 0,
   centre: "", open: false, why: "", mayOrder: false, offers: null, who: "", stream: null,
   options: { sigmas: 2, trails: true, vectors: true, labels: true, tentative: true, coverage: true, grid: true },
 };
-const chart = new Chart(state.tracks, { base: drawBase(state), picture: drawTracks(state), mark: drawChosen(state) }, (id) => choose(id));
+const chart = new Chart(state.tracks, { base: drawBase(state), picture: drawTracks(state), mark: drawChosen(state) }, ground, (id) => choose(id));
 const list = new List(state, choose);
 const track = new Track(state, act, () => orders.open());
 const orders = new Orders(state);
 const sources = new Sources(state, (source) => orders.open({ source }));
 const alarms = new Alarms();
 const log = new Log(choose);
+
+/** The corners of what is known of the place where there are no tracks: origin of the frame, the centre's
+ *  sensors with their coverage. */
+function ground() {
+  const { frame, around, geo } = state.tracks;
+  const near = (x) => (geo ? x + 360 * Math.round((around - x) / 360) : x);
+  const [x, y] = frame?.kind === "enu" ? [near(frame.lon), frame.lat] : [NaN, NaN];
+  const origin = Number.isFinite(x) ? [[x - 0.1, y - 0.05], [x + 0.1, y + 0.05]] : [];
+  const shown = Object.entries(state.places).filter(([name, one]) => state.colours.has(name) && placed(state.tracks, one));
+  return [...origin, ...shown.flatMap(([, one]) => [one.place, ...one.outline].map(([east, north]) => [near(east), north]))];
+}
 
 function choose(id, look = false) {
   const before = state.chosen;
@@ -78,7 +89,7 @@ function showCondition() {
   say(byId("link").lastElementChild, words);
   const banner = byId("banner");
   banner.hidden = how === "live" || (how === "waiting" && !state.tracks.count);
-  say(banner, `Stale: ${words}`);
+  say(banner, state.tracks.picture ? `Stale: ${words}` : words);
   const own = how === "closed" || how === "stale" ? [{ text: words, since: null }] : [];
   alarms.show(state.health, own);
 }
@@ -140,10 +151,12 @@ const takes = {
   health(message) {
     state.health = message;
     state.colours = new Map(message.sources.map((one) => [one.name, one.colour]));
+    state.states = new Map(message.sources.map((one) => [one.name, one.state]));
     sources.show(message);
     showCondition();
-    if (JSON.stringify([...state.colours]) !== chart.coloured) {
-      chart.coloured = JSON.stringify([...state.colours]);
+    const coloured = JSON.stringify([...state.colours, ...state.states]);
+    if (coloured !== chart.coloured) {
+      chart.coloured = coloured;
       chart.redraw("base", "mark");
     }
   },
@@ -162,6 +175,8 @@ function begin(centre) {
     state.tracks.clear();
     log.clear();
     state.health = null;
+    state.colours = new Map();
+    state.states = new Map();
     choose(null);
     chart.touched = false;
   }
@@ -195,8 +210,9 @@ state.stream = new Stream(() => ({ centre: state.centre, track: state.chosen }),
 setInterval(showCondition, 1000);
 byId("layers").open = false;
 
-/** For tests and measurements: where a track is on the screen, and what drawing took. */
+/** For tests and measurements: where a track and a sensor are on the screen, and what drawing took. */
 globalThis.fusionConsole = {
   at: (id) => (state.tracks.row(id) < 0 ? null : chart.pixel(state.tracks.row(id))),
+  sensor: (name) => chart.place(placed(state.tracks, state.places[name])(state.places[name].place)),
   figures: () => ({ tracks: state.tracks.count, bytes: state.stream.bytes, took: chart.layers?.map((one) => one.took) ?? [] }),
 };

@@ -19,6 +19,15 @@ export function unit(geo, y) {
   return geo ? 1 / (ROUND * Math.max(Math.cos((y * Math.PI) / 180), 0.05)) : 1;
 }
 
+/** From a source's own longitude and latitude, or x and y, to the map's unit, near to the picture; null where the source
+ *  is in a frame that is not shown. */
+export function placed(tracks, place) {
+  const { geo, frame, around } = tracks;
+  if (geo ? place.local !== undefined : place.local !== frame.name) return null;
+  const turns = geo ? Math.round((around - place.place[0]) / 360) : 0;
+  return ([x, y]) => world(geo, x + 360 * turns, y);
+}
+
 class Trails {
   constructor() {
     this.rows = new Map();
@@ -113,6 +122,7 @@ export class Tracks {
       this.trails = new Trails();
     }
     this.frame = message.frame;
+    this.around = message.around;
     this.picture = message;
     this.count = message.slot.length;
     this.rowOf = new Map();

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from fusion_service.decision_words import MINE, SAID, THEIRS, made_again
 from fusion_service.recording import RawMessage
 from fusion_service.recording.steps import Step
 from fusion_service.review.explain.histories import GONE
@@ -22,6 +23,8 @@ from schemas.messages import (
     BORN,
     BROKEN,
     COASTING,
+    COASTING_NOW,
+    CONFIRMED_NOW,
     DELETED,
     EXCHANGED,
     GATE_FAILED,
@@ -50,8 +53,8 @@ Recent = Mapping[str, deque[RawMessage]]
 Decided = dict[Member, tuple[str, float]]
 """What was decided of each member in a step: the word, and d2."""
 
-WORDS = {LINKED: "linked", KEPT: "kept", GATE_FAILED: "outside its gate", BROKEN: "broken off"}
-CAME, WENT = "comes over by exchange from", "goes over by exchange to"
+OF_MEMBERS = (LINKED, KEPT, GATE_FAILED, BROKEN)
+CAME, WENT = MINE[EXCHANGED], THEIRS[EXCHANGED]
 SILENT = "the source has said nothing new"
 MOST_HAPPENINGS = 10_000
 
@@ -160,7 +163,7 @@ class Story:
             elif kind == "era":
                 self.say(at, "the clock was set back: a new era began")
             elif kind == "revised" and sources & set(_listed(event.get("sources"))):
-                self.say(at, _revised(event, at))
+                self.say(at, made_again(event, at))
             elif kind in ("suspended", "resumed") and self.track in _listed(event.get("tracks")):
                 self.say(at, "suspended: all that could see it are silent" if kind == "suspended" else "back")
             elif kind in ("found", "lost") and source in sources:
@@ -202,22 +205,22 @@ class Story:
             if kind == EXCHANGED and member[0]:
                 decided[member] = (CAME if mine else WENT), value
                 self.say(at, CAME if mine else WENT, member, other if mine else int(one.track[row]), value)
-            elif mine and kind in WORDS and member[0]:
-                decided[member] = WORDS[kind], value
-                told.add((WORDS[kind], member))
-                self._repeat(at, WORDS[kind], member, value)
+            elif mine and kind in OF_MEMBERS and member[0]:
+                decided[member] = SAID[kind], value
+                told.add((SAID[kind], member))
+                self._repeat(at, SAID[kind], member, value)
             elif kind == BORN:
-                self.say(at, "born")
+                self.say(at, SAID[BORN])
             elif kind == SPLIT:
                 whom = other if mine else int(one.track[row])
-                self.say(at, "split from" if mine else "split off it:", None, whom, value)
+                self.say(at, (MINE if mine else THEIRS)[SPLIT], None, whom, value)
                 self.ordered |= {SPLIT} if mine and _split_by_order(log, self.track) else set()
             elif kind == DELETED:
-                self.ended = at, "lost", None
+                self.ended = at, SAID[DELETED], None
             elif kind == MERGED:
                 self.ended = (at, "merged", other) if mine else self.ended
                 self.ordered |= {MERGED} if mine and _merged_by_order(log, self.track) else set()
-                self.say(at, "merged into" if mine else "took in", None, other if mine else int(one.track[row]), value)
+                self.say(at, (MINE if mine else THEIRS)[MERGED], None, other if mine else int(one.track[row]), value)
         for key in [key for key in self._open if key not in told]:
             del self._open[key]
         return decided
@@ -247,7 +250,7 @@ class Story:
         at, status = picture.time, int(picture.status[row])
         if self.first < 0:
             self.first = at
-            if not any(one.what == "born" for one in self.happenings):
+            if not any(one.what == SAID[BORN] for one in self.happenings):
                 self.say(at, "there already")
         self.last, self.steps = at, self.steps + 1
         existence = float(picture.existence[row])
@@ -274,8 +277,8 @@ class Story:
     def _left(self, member: Member, link: Link, at: int, log: StepLog | None, word: str, recent: Recent) -> None:
         """The member is no part of this step; word: what was decided of it."""
         after, was_aside = _elsewhere(member, log, self.track), link.aside
-        link.there, link.aside = False, word == WORDS[GATE_FAILED]
-        if link.aside or word in (WORDS[BROKEN], WENT):
+        link.there, link.aside = False, word == SAID[GATE_FAILED]
+        if link.aside or word in (SAID[BROKEN], WENT):
             return
         why = _why(member, at, log, recent) if after is None else ""
         if was_aside and why.startswith(SILENT):
@@ -325,19 +328,12 @@ def _split_by_order(log: StepLog, track: int) -> bool:
     return any(len(local) == 3 and (local[0], local[2]) in members for local in locals_)
 
 
-def _revised(event: dict[str, Any], at: int) -> str:
-    """What a step says of those that were made again before it."""
-    since, names = event.get("since"), ", ".join(map(str, _listed(event.get("sources"))[:3]))
-    back = f" from {(at - since) / 1e9:.1f} s before on" if isinstance(since, int) else ""
-    return f"made again{back}, with late data of {names}"
-
-
 def _change(before: int, status: int) -> str:
     if status == COASTING:
-        return "coasts: no source has it"
+        return SAID[COASTING_NOW]
     if status == TENTATIVE:
         return "is tentative again"
-    return "has a source again" if before == COASTING else "confirmed"
+    return "has a source again" if before == COASTING else SAID[CONFIRMED_NOW]
 
 
 def members_of(picture: GlobalTracks, row: int) -> dict[Member, float]:

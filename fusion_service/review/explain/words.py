@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
+from fusion_service.decision_words import MINE, SAID, THEIRS
 from fusion_service.densities import moments
 from fusion_service.errors import ReviewError
 from fusion_service.labels import utc
@@ -16,11 +17,11 @@ from fusion_service.review.explain.histories import GONE, TrackHistory
 from fusion_service.review.explain.mission import RecordedMission, Refusals
 from fusion_service.review.explain.story import CAME, WENT, Composition, Happening, Link, Member, Story, local_messages
 from schemas import STATUSES, LocalTracks
-from schemas.messages import COASTING, MERGED, SPLIT, TENTATIVE
+from schemas.messages import BORN, BROKEN, COASTING, CONFIRMED_NOW, GATE_FAILED, KEPT, MERGED, SPLIT, TENTATIVE
 
 __all__ = ["explanation", "listing"]
 
-RUNNING = ("kept", "outside its gate")
+RUNNING = (SAID[KEPT], SAID[GATE_FAILED])
 SPELLS = 6
 """Spells of a link inside and outside its gate that are told one by one."""
 LONGEST_CHAIN = 20
@@ -72,8 +73,8 @@ def _ways(mission: RecordedMission) -> list[str]:
 
 def _became(mission: RecordedMission, life: TrackHistory) -> str:
     label = mission.labels
-    parts = [] if life.parent is None else [f"split from {label(life.parent)}"]
-    parts += [f"took in {', '.join(map(label, life.took))}"] if life.took else []
+    parts = [] if life.parent is None else [f"{MINE[SPLIT]} {label(life.parent)}"]
+    parts += [f"{THEIRS[MERGED]} {', '.join(map(label, life.took))}"] if life.took else []
     if life.ended is None:
         return "; ".join([*parts, "there at the end"])
     _, reason, heir = life.ended
@@ -126,7 +127,7 @@ class _Teller:
 
     def timeline(self) -> list[str]:
         rows = [("s", "what")]
-        told = sorted(_compact(self.story.happenings), key=lambda one: (one.first, one.what != "born"))
+        told = sorted(_compact(self.story.happenings), key=lambda one: (one.first, one.what != SAID[BORN]))
         lines = [(one.first, self._span(one.first, one.last), self._what(one)) for one in told]
         lines += [(one.first, self._span(one.first, one.last), self._refusal(one)) for one in self._refusals()]
         lines += list(self._fused_by())
@@ -152,10 +153,10 @@ class _Teller:
 
     def _distance(self, one: Happening) -> str:
         if not math.isfinite(one.low):
-            return ", alone" if one.what == "kept" else ""
+            return ", alone" if one.what == SAID[KEPT] else ""
         span = "-".join(dict.fromkeys((f"{one.low:.1f}", f"{one.high:.1f}")))
-        gate = self.gate if one.what.startswith(("kept", "outside", "broken")) else self.new_gate
-        gate = self.merge_gate if one.what in ("merged into", "took in") else gate
+        gate = self.gate if one.what.startswith((*RUNNING, SAID[BROKEN])) else self.new_gate
+        gate = self.merge_gate if one.what in (MINE[MERGED], THEIRS[MERGED]) else gate
         return f", d2 {span}" + (f" of gate {gate:.1f}" if math.isfinite(gate) else "")
 
     def _refusals(self) -> list[Refusals]:
@@ -208,8 +209,8 @@ class _Teller:
 
     def _began(self) -> list[str]:
         story, name = self.story, self.label(self.story.track)
-        born = next((one for one in story.happenings if one.what == "born"), None)
-        split = next((one for one in story.happenings if one.what == "split from"), None)
+        born = next((one for one in story.happenings if one.what == SAID[BORN]), None)
+        split = next((one for one in story.happenings if one.what == MINE[SPLIT]), None)
         life = self.mission.histories.known[story.track]
         at = self.time(story.first)
         if born is None:
@@ -221,7 +222,7 @@ class _Teller:
         if parent is not None:
             why = "by an operator's order" if SPLIT in story.ordered else "with which it no longer agreed"
             text += f", split from track {self.label(parent)} {why}"
-        confirmed = next((one for one in story.happenings if one.what == "confirmed"), None)
+        confirmed = next((one for one in story.happenings if one.what == SAID[CONFIRMED_NOW]), None)
         if confirmed is None:
             return [f"{text}; it was never confirmed."]
         when = "at once" if confirmed.first == born.first else f"{(confirmed.first - born.first) / 1e9:.1f} s later"
@@ -236,16 +237,16 @@ class _Teller:
             said.append(f"{self.names(late)} joined later.")
         for one in story.happenings:
             at = self.time(one.first)
-            if one.what == "broken off" and one.member is not None:
+            if one.what == SAID[BROKEN] and one.member is not None:
                 why = "too far from the others" if math.isfinite(one.low) else "another has its place"
                 said.append(f"{self.name(one.member)} was broken off at {at} s: {why}.")
             elif one.what in (CAME, WENT) and one.member is not None and one.other is not None:
                 how, where = ("came over from", "here") if one.what == CAME else ("went over to", "there")
                 whom = f"{self.name(one.member)} {how} track {self.label(one.other)}"
                 said.append(f"{whom} at {at} s: it fits better {where}.")
-            elif one.what == "took in" and one.other is not None:
+            elif one.what == THEIRS[MERGED] and one.other is not None:
                 said.append(f"It took in track {self.label(one.other)} at {at} s.")
-            elif one.what == "split off it:" and one.other is not None:
+            elif one.what == THEIRS[SPLIT] and one.other is not None:
                 said.append(f"Track {self.label(one.other)} was split off it at {at} s.")
         if story.status["coasting"]:
             said.append(f"It coasted for {story.status['coasting']} of its {story.steps} steps.")
@@ -347,7 +348,7 @@ def _compact(happenings: Sequence[Happening]) -> list[Happening]:
 def _joined(some: Sequence[Happening]) -> Happening:
     kept, outside = ([one for one in some if one.what == what] for what in RUNNING)
     steps = sum(one.steps for one in outside)
-    what = f"kept {sum(one.steps for one in kept)} steps, outside its gate {steps} in {len(outside)} spells"
+    what = f"{RUNNING[0]} {sum(one.steps for one in kept)} steps, {RUNNING[1]} {steps} in {len(outside)} spells"
     low, high = np.fmin.reduce([one.low for one in some]), np.fmax.reduce([one.high for one in some])
     return Happening(
         some[0].first, max(one.last for one in some), what, some[0].member, None, 1, float(low), float(high)

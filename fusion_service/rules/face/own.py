@@ -233,10 +233,12 @@ def _given(rule: OwnRule, means: Floats, covariances: Floats, options: Mapping[s
     title = f"rule {rule.path}:{rule.function.__name__}"
     try:
         result = rule.function(means, covariances, **options)
-    except (Exception, SystemExit) as error:
+        parts = _parts(result)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # whatever it raises, SystemExit and its own kinds too, ends no centre
         where = f", line {line}" if (line := _line(error, rule.path)) else ""
         raise RuleError(f"{title}: {type(error).__name__}: {error}{where}") from None
-    parts = _parts(result)
     wanted: list[tuple[int, ...]] = [(size, n), (size, n, n), (size, N)]
     words = f"mean {wanted[0]} and covariance {wanted[1]}; weights {wanted[2]} may be third"
     legend = f"(B, n), (B, n, n), (B, N) of means {(size, N, n)}"
@@ -245,7 +247,7 @@ def _given(rule: OwnRule, means: Floats, covariances: Floats, options: Mapping[s
         raise RuleError(f"{title}: gives {got}, not {words}: {legend}")
     try:
         arrays = [np.asarray(part, dtype=np.float64) for part in parts]
-    except (TypeError, ValueError) as error:
+    except Exception as error:
         raise RuleError(f"{title}: gives no numbers ({error}), not {words}: {legend}") from None
     shapes = [one.shape for one in arrays]
     if shapes != wanted[: len(shapes)]:
