@@ -38,7 +38,6 @@ from schemas import (
     MessageError,
     Status,
     check_source,
-    digest,
 )
 
 __all__ = ["History", "Key", "Late", "Past", "key_of"]
@@ -153,7 +152,7 @@ class History:
             if due > last - self._just or event.time < last - self._lateness:
                 continue
             try:
-                code = digest(event)
+                code = intake.ahead.digest(event)
             except MessageError:
                 continue
             key = source_of(event), event.epoch, event.seq, code
