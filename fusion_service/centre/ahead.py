@@ -7,6 +7,7 @@ what finds it asking the same, and makes the rest itself.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple, Protocol
@@ -18,9 +19,10 @@ from fusion_service.centre.extents import tells_extent
 from fusion_service.centre.lineage import Lineages
 from fusion_service.centre.scans import Scan, message_tracks
 from fusion_service.centre.sources import Source
-from fusion_service.centre.tracks import Tracks
+from fusion_service.centre.tracks import Tracks, unlinked
 from fusion_service.centre.words import Lexicon, Words
 from fusion_service.config import CentreConfig, SourceConfig
+from fusion_service.records import altered
 from schemas import Frame, Height, LocalTracks, Message, check_numbers, digest
 
 __all__ = ["LARGE", "Ahead", "Asked"]
@@ -28,7 +30,8 @@ __all__ = ["LARGE", "Ahead", "Asked"]
 LARGE = 256
 """Tracks of a message from which on it is worth while: small ones cost calls, and are made together."""
 MOST = 50_000
-"""Tracks of all messages that are made ahead: their tables are about as large as they."""
+"""Tracks of all messages that are made ahead: their tables are about as large as they. Those that were taken last stay
+as long as there is room, for steps that are made again."""
 
 
 class Border(Protocol):
@@ -68,14 +71,15 @@ class Ahead:
 
     def __init__(self) -> None:
         self._made: dict[int, _Made] = {}
+        self._taken: deque[int] = deque()
         self._tracks = 0
 
     def make(self, message: Message, intake: Border) -> None:
         """All that can be, of a message that may be taken. Never raises: what is wrong with it is found in the step."""
-        if not isinstance(message, LocalTracks) or not LARGE <= len(message.ids) <= MOST - self._tracks:
+        if not isinstance(message, LocalTracks) or not LARGE <= len(message.ids) <= MOST or id(message) in self._made:
             return
         source = intake.sources.get(message.source)
-        if id(message) in self._made or (source is not None and _is_refused(message, source)):
+        if (source is not None and _is_refused(message, source)) or not self._has_room(len(message.ids)):
             return
         try:
             code, (faults,) = digest(message), check_numbers([message])
@@ -107,15 +111,21 @@ class Ahead:
         known = self._made.get(id(message))
         if known is None or known.table is None or known.table[0] != asked:
             return None
-        (_, table), known.table = known.table, None  # its columns of links will be written to
-        return table
+        count = len(message.ids)
+        return altered(known.table[1], **unlinked(count))  # these columns are written to
+
+    def _has_room(self, count: int) -> bool:
+        """Make room for so many tracks, where it is not taken by what is queued: the oldest goes."""
+        while self._taken and self._tracks + count > MOST:
+            made = self._made.pop(self._taken.popleft())
+            self._tracks -= len(made.message.ids)
+        return self._tracks + count <= MOST
 
     def forget(self, queue: Sequence[tuple[Message, int]]) -> None:
-        """All but what is still queued."""
-        if self._made:
+        """Nothing but these messages is queued any more."""
+        if len(self._made) > len(self._taken):
             held = {id(message) for message, _ in queue}
-            self._made = {key: made for key, made in self._made.items() if key in held}
-            self._tracks = sum(len(made.message.ids) for made in self._made.values())
+            self._taken = deque(key for key in self._made if key not in held)
 
 
 def _is_refused(message: LocalTracks, source: Source) -> bool:

@@ -256,7 +256,7 @@ class Centre(ABC):
         if self._ids.book is not None:
             self._ids.book.again(revision.steps[0].number - 1, revision.tables, revision.there)
         state = revision.steps[0].state
-        self._intake = Intake(self.config)
+        self._intake = Intake(self.config, self._intake.ahead)
         self._intake.spared = revision.steps[0].spared.rested()
         self._labels = Labels(self._intake)
         self._begin()

@@ -61,7 +61,7 @@ _Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]
 class Intake:
     """The queue before the step, and the sources behind it. Everything in it is bounded, whatever is sent."""
 
-    def __init__(self, config: CentreConfig) -> None:
+    def __init__(self, config: CentreConfig, ahead: Ahead | None = None) -> None:
         self.config = config
         self._nothing = empty_tracks(len(config.space))
         self.frame: Frame | None = config.frame
@@ -70,7 +70,7 @@ class Intake:
         self.sources: dict[str, Source] = {}
         self.resting: dict[str, Resting] = {}
         self.queue: list[_Queued] = []
-        self.ahead = Ahead()
+        self.ahead = ahead or Ahead()
         self.raw: dict[tuple[str, int, int, int], tuple[Message, int, int]] = {}
         self._held: Counter[str] = Counter()
         self._components = 0
