@@ -65,7 +65,8 @@ def _by_group(
 
 
 def locals_of(rows: Rows, names: tuple[str, ...], at: Ints, groups: Ints, chosen: Ints) -> list[list[LocalKey]]:
-    """The local tracks, in order, of each of the groups `chosen`, which are in order; groups (A,): of the rows `at`; names: of sources."""
+    """The local tracks, in order, of each of the groups `chosen`, which are in order; groups (A,): of the rows `at`;
+    names: of sources."""
     some = at[among(groups, chosen)]
     group_of = groups[among(groups, chosen)]
     order = np.argsort(group_of, kind="stable")

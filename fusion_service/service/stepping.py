@@ -14,8 +14,8 @@ import dataclasses
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -336,7 +336,15 @@ def _settles(result: StepResult, kind: str) -> bool:
     merged = any(heir is not None for _, _, heir in picture.ended)
     known = messages.BORN if kind == "intensity" else messages.CONFIRMED_NOW
     began = np.isin(log.decisions.kind, (known, messages.CONFIRMED_NOW)).any()
-    return bool(merged or picture.split_from or log.events or began)
+    return bool(merged or picture.split_from or any(map(_lasts, log.events)) or began)
+
+
+def _lasts(event: Mapping[str, Any]) -> bool:
+    """Whether a lost checkpoint would take back what an event tells. Not that steps were skipped, which costs most when
+    it is saved each time, and is told anew by a service that begins anew; nor that some were made again for late data,
+    where no track came back by that: what began or ended is noted."""
+    kind = event.get("kind")
+    return kind != "skipped" and (kind != "revised" or "back" in event)
 
 
 def _name_of(message: Message) -> tuple[str, str, int, int]:
