@@ -3,7 +3,7 @@
 Of every step of the last `lateness`, and of so much more as late data may have to wait for their turn, it keeps what
 went into it: orders, sources that came and went, the messages taken. Of some it keeps the state before them, as a
 checkpoint: one in about an eighth of `lateness`, fewer where the tables are large, and of the newest `RECENT` while
-data come late. A message is late where a step that was made should have taken it, by its time. Before the next step the
+data come late, or where there are `MANY` tracks, so that one late scan costs a step and not six. A message is late where a step that was made should have taken it, by its time. Before the next step the
 centre then goes back to the newest kept state before that one, and makes the steps from there again with all of their
 inputs, each where it belongs by its time.
 
@@ -48,6 +48,9 @@ MOST_ROWS = 1_000_000
 """Tracks, local and global, in all kept states together; above that there are fewer states, but two at least."""
 RECENT = 3
 """Newest states that are kept while data come late."""
+MANY = 2000
+"""Tracks, local and global, from which on they are always kept, but while the centre is behind: to keep one costs a
+tenth of a step."""
 JUST = 1_000_000
 """ns: on arrival, a scan of that much before the newest step belongs to it as much as to one of its own."""
 CALM = 2_000_000_000
@@ -220,7 +223,8 @@ class History:
         spacing = self._lateness // max(2, min(STATES, MOST_ROWS // max(rows, 1)))
         if kept is None or last - kept.before >= spacing:
             return True
-        return False if number < self._busy and left < RECENT else None
+        recent = number < self._busy or (rows >= MANY and last >= self._calm)
+        return False if recent and left < RECENT else None
 
     def told_in(self, status: Status) -> Status:
         """A status with what was put in its place, and how many steps were made again, since the start."""
