@@ -3,9 +3,10 @@
 Of every step of the last `lateness`, and of so much more as late data may have to wait for their turn, it keeps what
 went into it: orders, sources that came and went, the messages taken. Of some it keeps the state before them, as a
 checkpoint: one in about an eighth of `lateness`, fewer where the tables are large, and of the newest `RECENT` while
-data come late, or where there are `MANY` tracks, so that one late scan costs a step and not six. A message is late where a step that was made should have taken it, by its time. Before the next step the
-centre then goes back to the newest kept state before that one, and makes the steps from there again with all of their
-inputs, each where it belongs by its time.
+data come late, or where there are `MANY` tracks, so that one late scan costs a step and not six. A message is late
+where a step that was made should have taken it, by its time. Before the next step the centre then goes back to the
+newest kept state before that one, and makes the steps from there again with all of their inputs, each where it belongs
+by its time.
 
 Once in a step at most, and no more than `revise` steps for each step on the average: what there is no room for now is
 taken as it comes, and put in its place when steps are made again the next time. So the cost of late data is bounded,
@@ -223,7 +224,8 @@ class History:
         spacing = self._lateness // max(2, min(STATES, MOST_ROWS // max(rows, 1)))
         if kept is None or last - kept.before >= spacing:
             return True
-        recent = number < self._busy or (rows >= MANY and last >= self._calm)
+        many = MANY <= rows <= MOST_ROWS // STATES
+        recent = number < self._busy or (many and last >= self._calm)
         return False if recent and left < RECENT else None
 
     def told_in(self, status: Status) -> Status:

@@ -1,4 +1,4 @@
-"""The disk is waited for on another thread, and what steps were skipped or made again is not saved before publishing."""
+"""The disk is waited for on another thread; that steps were skipped or made again is not saved before publishing."""
 
 from __future__ import annotations
 
