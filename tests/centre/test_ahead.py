@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import schemas
-from fusion_service.centre import FusionCentre, ahead, births, neighbours
+from fusion_service.centre import FusionCentre, ahead, births, history, neighbours
 from fusion_service.centre.ahead import Ahead
 from fusion_service.centre.linking import Linker
 from fusion_service.centre.rows import Rows
@@ -104,6 +104,42 @@ def test_what_is_made_ahead_changes_nothing(settings: dict[str, Any], monkeypatc
     assert (used["table"], used["digest"]) == (0, 0)
     assert lists < used["list"]
     assert foreseen > sum(states)
+
+
+def after_calm(late_at: int) -> tuple[list[bytes], list[int]]:
+    """The pictures of steps, one scan of which is late at `late_at`; how many steps were made again."""
+    rng, out, again = np.random.default_rng(8), [], []
+    centre = FusionCentre({"period": 0.1, "frame_wait": 0.0, "lateness": 5.0})
+    for step in range(late_at + 3):
+        time = 1000 * SECOND + step * PERIOD
+        messages = [scan(source, step, time, rng) for source in range(SOURCES)]
+        held = messages.pop() if step == late_at else None
+        for message in messages:
+            centre.handle(message, time + 1)
+        result = centre.step(time)
+        again += [event["steps"] for event in result.log.events if event["kind"] == "revised"]
+        out.append(schemas.encode(result.tracks))
+        if held is not None:
+            centre.handle(held, time + 2)
+    return out, again
+
+
+def test_a_late_scan_of_many_tracks_after_a_calm_time_costs_one_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    seldom = after_calm(5)
+    made: list[int] = []
+    make = FusionCentre._make
+
+    def counted(self: FusionCentre, time: int, *given: Any) -> Any:
+        made.append(time)
+        return make(self, time, *given)
+
+    monkeypatch.setattr(FusionCentre, "_make", counted)
+    assert after_calm(5) == seldom
+    often = len(made)
+    made.clear()
+    monkeypatch.setattr(history, "MANY", 100)
+    assert after_calm(5)[0] == seldom[0]
+    assert len(made) == 8 + 1 < often
 
 
 def test_messages_of_every_kind_are_the_same_made_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
