@@ -81,8 +81,9 @@ def parts(times: dict[str, float]) -> Iterator[None]:
             setattr(owner, attribute, before[name])
 
 
-def run(load: Load, settings: dict[str, Any], count: int = 14, warm: int = 5) -> str:
-    """A line: the median step after `warm`, its parts, reading, saving and packing, and the ratio to the floor."""
+def run(load: Load, settings: dict[str, Any], count: int = 24, warm: int = 12) -> str:
+    """A line: the median step after `warm`, when memory has settled, its parts, reading, saving and packing, and the
+    ratio to the floor."""
     world, period = load.world(), 1.0 / load.rate
     sources = {f"load-{s + 1:02d}": {"override": True, "period": period} for s in range(load.sources)}
     frame = {"kind": "enu", "lat": FRAME.lat, "lon": FRAME.lon}

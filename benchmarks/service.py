@@ -7,11 +7,11 @@
 Sources publish scans of tracks with unequal covariances (`benchmarks.load`) at the times these hold; the sink, which
 is this process, notes when each picture comes. Told are: updates offered and taken a second; from the publication of
 a scan to the arrival of the first picture that has it (by the step log): p50, p90, p99 and the largest; steps that
-were skipped; CPU of each process and of the rest of the machine; bytes; memory of the service at the beginning and at
-the end; and of the pictures at the sink, whether every target was in each once: a global track within `NEAR` sigmas...
-of its truth, and no second one. The floor is the least that could be done with the same bytes: unpack them, fuse once
-by `naive` in one batch, pack the result, timed in this run before the load begins; the ratio is the service's CPU a
-step beside it. The first `WARM` seconds do not count.
+were skipped; CPU of each process and of the rest of the machine; bytes; memory of the service at the beginning, after
+each quarter and at the end, and what of it are no pages of files; and of the pictures at the sink, whether every target
+was in each once: a global track within `NEAR` sigmas of its truth, and no second one. The floor is the least that could
+be done with the same bytes: unpack them, fuse once by `naive` in one batch, pack the result, timed in this run before
+the load begins; the ratio is the service's CPU a step beside it. The first `WARM` seconds do not count.
 """
 
 from __future__ import annotations
@@ -43,6 +43,7 @@ from fusion_service.service.daemon import run_service
 __all__ = ["Burst", "Report", "Way", "measure", "setting"]
 
 WARM = 3.0
+QUARTERS = 4
 DRAIN = 3.0
 """Seconds for what is under way at the end."""
 TICKS = os.sysconf("SC_CLK_TCK")
@@ -110,7 +111,8 @@ class Report:
     ratio: float = float("nan")
     bytes_in: float = 0.0
     bytes_out: float = 0.0
-    memory: tuple[float, float] = (0.0, 0.0)
+    memory: tuple[float, ...] = ()
+    own: tuple[float, ...] = ()
     missing: int = 0
     doubled: int = 0
     mixed: int = 0
@@ -135,8 +137,11 @@ class Report:
                 f"  {whole}",
                 f"  cores: {cpu}; other processes {self.others:.2f}",
                 f"  service {self.ratio:.1f} x the floor of {self.floor:.1f} ms a scan of all",
-                f"  MB/s in {self.bytes_in:.1f}, out {self.bytes_out:.1f}; memory of the service "
-                f"{self.memory[0]:.0f} -> {self.memory[1]:.0f} MB",
+                f"  MB/s in {self.bytes_in:.1f}, out {self.bytes_out:.1f}; memory of the service, MB: "
+                + " -> ".join(f"{one:.0f}" for one in self.memory)
+                + " (its own: "
+                + " -> ".join(f"{one:.0f}" for one in self.own)
+                + ")",
             )
         )
 
@@ -181,8 +186,10 @@ def _ticks(pid: int) -> float:
     return (user + nice + system + irq + soft) / TICKS
 
 
-def _resident(pid: int) -> float:
-    return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * PAGE / 2**20
+def _resident(pid: int) -> tuple[float, float]:
+    """Memory that a process has, MB, and what of it is its own: no pages of files, none shared."""
+    _, resident, shared = (int(pages) for pages in Path(f"/proc/{pid}/statm").read_text().split()[:3])
+    return resident * PAGE / 2**20, (resident - shared) * PAGE / 2**20
 
 
 @contextmanager
@@ -243,12 +250,14 @@ def _watch(report: Report, way: Way, start: int, processes: Mapping[str, Any]) -
     time.sleep(max(0.0, start / 1e9 + WARM - time.time()))
     pids = {name: process.pid for name, process in processes.items()} | {"sink": os.getpid()}
     before, machine, begin = {name: _ticks(pid) for name, pid in pids.items()}, _ticks(0), time.monotonic()
-    resident = _resident(pids["service"])
-    time.sleep(max(0.0, start / 1e9 + way.seconds - 0.2 - time.time()))
+    resident, end = [_resident(pids["service"])], start / 1e9 + way.seconds - 0.2
+    for left in range(QUARTERS - 1, -1, -1):
+        time.sleep(max(0.0, end - (end - start / 1e9 - WARM) * left / QUARTERS - time.time()))
+        resident.append(_resident(pids["service"]))
     span = time.monotonic() - begin
     report.cpu = {name: (_ticks(pid) - before[name]) / span for name, pid in pids.items()}
     report.others = (_ticks(0) - machine) / span - sum(report.cpu.values())
-    report.memory = resident, _resident(pids["service"])
+    report.memory, report.own = zip(*resident, strict=True)
     scans = span * way.load.rate
     report.ratio = 1e3 * report.cpu["service"] * span / scans / report.floor
 

@@ -39,9 +39,9 @@ _SLOTS = {kind: [(field.name, getattr(kind, field.name).__set__) for field in fi
 def encode(message: Message, *, sound: bool = False) -> bytes:
     """The MessagePack bytes of a message. `MessageError` if its parts do not fit together, a number does not
     fit its column, or a covariance is not symmetric. sound: its parts were made to fit together, so that this is
-    checked of a large message only, which may be larger than any reader takes."""
+    checked only of a message so large that no reader may take it."""
     data = _pack(message)
-    if sound and len(data) < MAX_ITEMS:
+    if sound and (len(data) < MAX_ITEMS or _is_readable(message, len(data))):
         return data
     for name in ("covariances", "position_covariance", "reference_covariances"):
         matrices = getattr(message, name, None)
@@ -52,6 +52,15 @@ def encode(message: Message, *, sound: bool = False) -> bytes:
                 raise MessageError("bad-field", f"{message.type}.{name}: {error}") from None
     decode(data)
     return data
+
+
+def _is_readable(message: Message, size: int) -> bool:
+    """Whether a message of so many bytes, whose parts fit together, is within what `decode` takes: surely, for that is
+    looked at from outside. What a log tells of events holds lists of its own."""
+    values = [getattr(message, slot) for slot, _ in _SLOTS[type(message)]]
+    listed = [value for value in values if isinstance(value, (tuple, list, dict))]
+    told = getattr(message, "events", ()) or any(isinstance(value, dict) for value in listed)
+    return size <= MAX_BYTES and not told and all(len(value) <= MAX_ITEMS for value in listed)
 
 
 def digest(message: Message) -> int:

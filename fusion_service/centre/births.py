@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Ints
+from fusion_service.arrays import Ints, among
 from fusion_service.centre.candidates import Pairs
 from fusion_service.centre.naming import LocalKey
 from fusion_service.centre.rows import Rows
@@ -63,11 +65,13 @@ def _by_group(
 
 
 def locals_of(rows: Rows, names: tuple[str, ...], at: Ints, groups: Ints, chosen: Ints) -> list[list[LocalKey]]:
-    """The local tracks, in order, of each of the groups `chosen`; groups (A,): of the rows `at`; names: of sources."""
-    place = dict(zip(chosen.tolist(), range(len(chosen)), strict=True))
-    found: list[list[LocalKey]] = [[] for _ in place]
-    columns = groups, rows.source[at], rows.epoch[at], rows.tracks.id[at]
-    for one, source, epoch, local in zip(*(column.tolist() for column in columns), strict=True):
-        if one in place:
-            found[place[one]].append((names[source], epoch, local))
-    return found
+    """The local tracks, in order, of each of the groups `chosen`, which are in order; groups (A,): of the rows `at`;
+    names: of sources."""
+    some = at[among(groups, chosen)]
+    group_of = groups[among(groups, chosen)]
+    order = np.argsort(group_of, kind="stable")
+    some = some[order]
+    whose = [names[source] for source in rows.source[some].tolist()]
+    keys = [*zip(whose, rows.epoch[some].tolist(), rows.tracks.id[some].tolist(), strict=True)]
+    ends = np.cumsum(np.bincount(np.searchsorted(chosen, group_of), minlength=len(chosen))).tolist()
+    return [keys[begin:end] for begin, end in pairwise([0, *ends])]

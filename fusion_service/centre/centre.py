@@ -192,8 +192,7 @@ class Centre(ABC):
     def _begin_step(self, time: int, events: tuple[tuple[Event, int], ...], left: int) -> Past:
         past = Past(self._step + 1, time, self._time, events, copy(self._intake.spared))
         if self._history.on:
-            rows = len(self._picture.id) + sum(len(one.tracks.id) for one in self._intake.sources.values())
-            kept = self._history.keeps(self._time, past.number, rows, left)
+            kept = self._kept_by_next(past.number, left)
             if kept is not None:
                 past.state, past.lasting = self._state or self.checkpoint(), kept
         self._step, self._state = past.number, None
@@ -201,6 +200,16 @@ class Centre(ABC):
             self._ids.book.step = past.number
             self._ids.book.forget(self._history.oldest)
         return past
+
+    def foresee(self) -> None:
+        """Make what the next step would begin with, where there is time: the state that it keeps. Nothing depends on
+        whether this is called."""
+        if self._history.on and self._state is None and self._kept_by_next(self._step + 1, 0) is not None:
+            self.checkpoint()
+
+    def _kept_by_next(self, number: int, left: int) -> bool | None:
+        rows = len(self._picture.id) + sum(len(one.tracks.id) for one in self._intake.sources.values())
+        return self._history.keeps(self._time, number, rows, left)
 
     def _revise(self) -> int | None:
         """Make the steps again that late data belong to. The time of the first that they change, ns; None: nothing is
@@ -247,7 +256,7 @@ class Centre(ABC):
         if self._ids.book is not None:
             self._ids.book.again(revision.steps[0].number - 1, revision.tables, revision.there)
         state = revision.steps[0].state
-        self._intake = Intake(self.config)
+        self._intake = Intake(self.config, self._intake.ahead)
         self._intake.spared = revision.steps[0].spared.rested()
         self._labels = Labels(self._intake)
         self._begin()

@@ -5,6 +5,7 @@ It holds sources with their sequence positions, orders, links and tracks, the gl
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import msgpack
@@ -33,6 +34,8 @@ __all__ = ["CHECKPOINT_VERSION", "CheckpointError", "Glance", "glance", "pack_st
 
 CHECKPOINT_VERSION = 2
 READABLE = (1, 2)
+_ROOM = threading.local()
+"""What packs, whose buffer, once it has grown to the size of a checkpoint, is there for the next one."""
 NO_ERA = (0, -1, -1, 0, -1, -1)
 
 
@@ -58,7 +61,9 @@ def pack_state(config_hash: str, state: dict[str, Any], intake: Intake, labels: 
         "awake": intake.spared.awake,
         **state,
     }
-    return cast(bytes, msgpack.packb(whole))
+    if not hasattr(_ROOM, "packer"):
+        _ROOM.packer = msgpack.Packer()
+    return cast(bytes, _ROOM.packer.pack(whole))
 
 
 def unpack_state(blob: bytes, intake: Intake, labels: Labels) -> tuple[dict[str, Any], Picture]:

@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from fusion_service.centre import notes
+from fusion_service.centre.ahead import Ahead, Asked
 from fusion_service.centre.batches import Checked
 from fusion_service.centre.declared import loosened
 from fusion_service.centre.extents import tells_extent
@@ -50,6 +51,8 @@ class Table(NamedTuple):
 class Border(Protocol):
     """What of the intake is asked here (see there)."""
 
+    @property
+    def ahead(self) -> Ahead: ...
     @property
     def config(self) -> CentreConfig: ...
     @property
@@ -90,7 +93,9 @@ class Conversion:
         sound = [faults == 0 for _, faults in self._runs[place]]
         words = self._intake.said, self._intake.lineages
         most = self._intake.config.max_components
-        tracks = message_tracks(messages, sound, frame, said.height, most, *words)
+        asked = Asked(frame, said.height, most)
+        tracks = self._intake.ahead.table(messages[0], asked) if len(messages) == 1 else None
+        tracks = tracks or message_tracks(messages, sound, frame, said.height, most, *words)
         return Table(messages, loosened(tracks, messages[0].space, said), self._intake.pace(source, first.complete))
 
     def _key(self, run: list[Checked]) -> _Key | None:

@@ -46,7 +46,8 @@ class FusionCentre(Centre):
         return self.config.rule
 
     def _begin(self) -> None:
-        self._linker = Linker(self.config, self._ids)
+        before: Linker | None = getattr(self, "_linker", None)
+        self._linker = Linker(self.config, self._ids, before.beside if before is not None else None)
         self._entries = Entries()
         self._blobs = Blobs(self.config)
         self._memory = Memory(self._intake)

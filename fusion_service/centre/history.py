@@ -3,9 +3,10 @@
 Of every step of the last `lateness`, and of so much more as late data may have to wait for their turn, it keeps what
 went into it: orders, sources that came and went, the messages taken. Of some it keeps the state before them, as a
 checkpoint: one in about an eighth of `lateness`, fewer where the tables are large, and of the newest `RECENT` while
-data come late. A message is late where a step that was made should have taken it, by its time. Before the next step the
-centre then goes back to the newest kept state before that one, and makes the steps from there again with all of their
-inputs, each where it belongs by its time.
+data come late, or where there are `MANY` tracks, so that one late scan costs a step and not six. A message is late
+where a step that was made should have taken it, by its time. Before the next step the centre then goes back to the
+newest kept state before that one, and makes the steps from there again with all of their inputs, each where it belongs
+by its time.
 
 Once in a step at most, and no more than `revise` steps for each step on the average: what there is no room for now is
 taken as it comes, and put in its place when steps are made again the next time. So the cost of late data is bounded,
@@ -38,7 +39,6 @@ from schemas import (
     MessageError,
     Status,
     check_source,
-    digest,
 )
 
 __all__ = ["History", "Key", "Late", "Past", "key_of"]
@@ -49,6 +49,9 @@ MOST_ROWS = 1_000_000
 """Tracks, local and global, in all kept states together; above that there are fewer states, but two at least."""
 RECENT = 3
 """Newest states that are kept while data come late."""
+MANY = 2000
+"""Tracks, local and global, from which on they are always kept, but while the centre is behind: to keep one costs a
+tenth of a step."""
 JUST = 1_000_000
 """ns: on arrival, a scan of that much before the newest step belongs to it as much as to one of its own."""
 CALM = 2_000_000_000
@@ -153,7 +156,7 @@ class History:
             if due > last - self._just or event.time < last - self._lateness:
                 continue
             try:
-                code = digest(event)
+                code = intake.ahead.digest(event)
             except MessageError:
                 continue
             key = source_of(event), event.epoch, event.seq, code
@@ -221,7 +224,9 @@ class History:
         spacing = self._lateness // max(2, min(STATES, MOST_ROWS // max(rows, 1)))
         if kept is None or last - kept.before >= spacing:
             return True
-        return False if number < self._busy and left < RECENT else None
+        many = MANY <= rows <= MOST_ROWS // STATES
+        recent = number < self._busy or (many and last >= self._calm)
+        return False if recent and left < RECENT else None
 
     def told_in(self, status: Status) -> Status:
         """A status with what was put in its place, and how many steps were made again, since the start."""

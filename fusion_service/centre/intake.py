@@ -13,6 +13,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fusion_service.centre import limits, notes
+from fusion_service.centre.ahead import Ahead
 from fusion_service.centre.batches import Checked, framed, run_key
 from fusion_service.centre.clock import horizon
 from fusion_service.centre.converting import Conversion
@@ -48,9 +49,7 @@ from schemas import (
     MessageError,
     Motion,
     SensorInfo,
-    check_numbers,
     check_source,
-    digest,
 )
 
 __all__ = ["Intake"]
@@ -62,7 +61,7 @@ _Keyed: TypeAlias = tuple[tuple[str, int, int, str, int, int], Message]
 class Intake:
     """The queue before the step, and the sources behind it. Everything in it is bounded, whatever is sent."""
 
-    def __init__(self, config: CentreConfig) -> None:
+    def __init__(self, config: CentreConfig, ahead: Ahead | None = None) -> None:
         self.config = config
         self._nothing = empty_tracks(len(config.space))
         self.frame: Frame | None = config.frame
@@ -71,6 +70,7 @@ class Intake:
         self.sources: dict[str, Source] = {}
         self.resting: dict[str, Resting] = {}
         self.queue: list[_Queued] = []
+        self.ahead = ahead or Ahead()
         self.raw: dict[tuple[str, int, int, int], tuple[Message, int, int]] = {}
         self._held: Counter[str] = Counter()
         self._components = 0
@@ -108,6 +108,7 @@ class Intake:
         """Queue a message, whatever there is."""
         self.wake(source_of(event))
         self.queue.append((event, received))
+        self.ahead.make(event, self)
         self._held[source_of(event)] += 1
         self._components += size_of(event)
 
@@ -240,6 +241,7 @@ class Intake:
         self.spared.note({name for name, _, dropped in self._refused if dropped}, time, last)
         self._present, self._refused, self._dead = {}, Counter(), None
         self._accept(self._due(time, journal), time, last, journal)
+        self.ahead.forget(self.queue)
 
     def _due(self, time: int, journal: Journal) -> list[_Keyed]:
         queue, self.raw = self.emptied(), {}
@@ -255,7 +257,7 @@ class Intake:
                     source.ahead = max(source.ahead, getattr(event, "time", -1))
                 continue
             try:
-                key = (name, event.epoch, event.seq, event.type, digest(event), received)
+                key = (name, event.epoch, event.seq, event.type, self.ahead.digest(event), received)
             except MessageError as error:
                 journal.refuse(Entry(name, 0, 0, 0, error.reason))
             else:
@@ -359,7 +361,7 @@ class Intake:
         journal.event({"kind": "frame", "source": min(name for name, vote in votes.items() if vote.frame == frame)})
 
     def _apply(self, items: list[tuple[Source, Scan, Entry]], time: int, journal: Journal) -> None:
-        codes = check_numbers([item[1] for item in items])
+        codes = self.ahead.faults([item[1] for item in items])
         checked = [
             ((source, as_tracks(message, faults), entry), faults)
             for (source, message, entry), faults in zip(items, codes, strict=True)

@@ -49,15 +49,16 @@ MEMORY = 0.75
 
 
 class Linker:
-    """The decisions about links, and the evidence gathered over steps: `merges` and `rivals`."""
+    """The decisions about links, and the evidence gathered over steps: `merges` and `rivals`. beside: who was near whom
+    in an earlier step, from which nothing follows but how long it takes to find who is now."""
 
-    def __init__(self, config: CentreConfig, ids: Ids) -> None:
+    def __init__(self, config: CentreConfig, ids: Ids, beside: Neighbours | None = None) -> None:
         self.config = config
         self.tests = Tests.of(config)
         self.merges = PairEvidence()
         self.rivals = RivalLinks()
         self.copies = Copies(config)
-        self._beside = Neighbours()
+        self.beside = beside or Neighbours()
         self._ids = ids
         self._settings = Settings(self.tests, config.space, config.manoeuvre)
         n = len(config.space)
@@ -74,7 +75,7 @@ class Linker:
         """
         meeting.settle(step, journal)
         judged = judge(rows, now, meeting.forced_row, time, self._settings, journal)
-        near = find_candidates(rows, now, meeting, judged, self.tests, self._places, self._beside)
+        near = find_candidates(rows, now, meeting, judged, self.tests, self._places, self.beside)
         near = _without_broken(near, rows, now, judged)
         before, believed = rows.tracks.link.copy(), rows.inside_mask()
         joined = self._assign(rows, now, _vacant(near, meeting), step, journal)

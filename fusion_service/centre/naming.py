@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,8 +49,7 @@ class Places:
     gate: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Birth:
+class Birth(NamedTuple):
     """A global id as it was given: in which step, to which local track, or where (mean, covariance)."""
 
     step: int
@@ -130,10 +130,12 @@ class Book:
             known = [two if one is None else one for one, two in zip(known, self._linked(open_), strict=True)]
         new = iter(fresh(known.count(None)))
         ids = [next(new) if one is None else one for one in known]
-        for place, one in enumerate(ids):
-            founder = None if isinstance(whom, Places) or not whom[place] else whom[place][0]
-            where = (whom.mean[:, place], whom.covariance[:, :, place]) if isinstance(whom, Places) else None
-            self.born.append(Birth(self.step, one, founder, where))
+        step = self.step
+        if isinstance(whom, Places):
+            where = ((whom.mean[:, place], whom.covariance[:, :, place]) for place in range(count))
+            self.born += [Birth(step, one, None, place) for one, place in zip(ids, where, strict=True)]
+        else:
+            self.born += [Birth(step, one, next(iter(group), None)) for one, group in zip(ids, whom, strict=True)]
         return ids
 
     def _take(self, ids: Iterable[int | None]) -> int | None:

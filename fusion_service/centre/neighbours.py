@@ -106,7 +106,7 @@ class Neighbours:
         self._rest -= self._rest > 0
         for _ in range(2):
             kept = self._list
-            if kept is not None and len(kept.position) == len(positions):
+            if kept is not None and len(ids) and len(kept.position) == len(positions):
                 place = self._place(kept, ids)
                 there = place >= 0
                 at, of = place[there], slice(None) if there.all() else there

@@ -103,8 +103,10 @@ def unpack_columns(packed: dict[str, Any], like: Columns) -> Columns:
     arrays = []
     for one in fields(like):
         empty = getattr(like, one.name)
-        blank = np.full(count, MISSING.get(one.name, 0)).astype(empty.dtype)
-        flat = blank if one.name not in packed else from_bytes(packed[one.name], empty)
+        if one.name in packed:
+            flat = from_bytes(packed[one.name], empty)
+        else:
+            flat = np.full(count, MISSING.get(one.name, 0)).astype(empty.dtype)
         if one.name == "extent":
             held = len(flat) // max(count, 1) if one.name in packed else 0
             empty, flat = np.zeros((held, 0)), flat[: held * count]

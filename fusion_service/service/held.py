@@ -16,7 +16,7 @@ import msgpack
 from fusion_service.centre import Order
 from fusion_service.order import order_event, order_of
 
-__all__ = ["HeldOrders", "synced"]
+__all__ = ["HeldOrders"]
 
 NAME = "orders"
 MOST_BYTES = 4 * 2**20
@@ -90,13 +90,3 @@ class _Start:
     def read(self, size: int) -> bytes:
         part, self._data = self._data[:size], self._data[size:]
         return part
-
-
-def synced(folder: Path) -> None:
-    """The checkpoint in `folder` is on disk, even where the power is cut. Raises OSError."""
-    for path in (folder / "checkpoint", folder):
-        handle = os.open(path, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)

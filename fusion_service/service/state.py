@@ -28,6 +28,7 @@ from fusion_service.centre import Order
 from fusion_service.errors import FusionError
 from fusion_service.service.files import FULL, Files, Notes, opened_folder
 from fusion_service.service.held import HeldOrders
+from fusion_service.service.syncing import Syncing
 from fusion_service.service.terms import NODES, generation_after
 
 __all__ = ["State", "StateError", "open_state"]
@@ -63,6 +64,7 @@ class State:
         self.held = HeldOrders(folder)
         """Orders that were answered and are in no checkpoint."""
         self._synced = 0.0
+        self._syncing = Syncing()
         self._last = 0
         self._unwritten = ""
         self._unsaved = ""
@@ -109,7 +111,8 @@ class State:
     @property
     def trouble(self) -> str:
         """See the class."""
-        return self._unsaved or self._unwritten
+        unsafe = self._syncing.trouble and f"the checkpoint in {self._folder} may not outlive a power cut: "
+        return self._unsaved or self._unwritten or (unsafe and unsafe + self._syncing.trouble)
 
     def new_generation(self, above: int = 0) -> int:
         """A generation that was never taken before, and is above that one, on disk when this returns; where the disk is
@@ -185,20 +188,20 @@ class State:
             self._files.set_aside("checkpoint", why)
 
     def save(self, blob: bytes) -> None:
-        """Replace the checkpoint at once: whole or not at all after kill -9; synced to disk every few seconds. Raises
-        OSError, which `trouble` tells until it is saved again."""
+        """Replace the checkpoint at once: whole or not at all after kill -9; brought to the disk every few seconds, on
+        another thread. Raises OSError, which `trouble` tells until it is saved again."""
         if self._files is not None and self._born is not None and self._ended is not None:
-            now = time.monotonic()
-            sync = now - self._synced > SYNC_PERIOD
-            self._synced = now if sync else self._synced
             try:
-                self._files.replace("checkpoint", blob, sync=sync)
+                self._files.replace("checkpoint", blob, sync=False)
                 self._born.clear()  # before what has ended, which must not begin again
                 self._ended.clear()
             except OSError as error:
                 self._unsaved = f"the checkpoint cannot be saved in {self._files.folder}: {error.strerror}"
                 raise
             self._unsaved = self._unwritten = ""
+            if (now := time.monotonic()) - self._synced > SYNC_PERIOD and not self._syncing.busy:
+                self._synced = now
+                self._syncing.begin(self._files.folder / "checkpoint")
 
     def ended(self) -> NDArray[np.uint64]:
         """The ids that have ended since the last checkpoint was made."""
@@ -226,6 +229,7 @@ class State:
 
     def close(self) -> None:
         """Let the files go."""
+        self._syncing.close()
         for notes in (self._ended, self._born):
             if notes is not None:
                 notes.close()

@@ -14,8 +14,8 @@ import dataclasses
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,10 +35,10 @@ from fusion_service.centre import (
 )
 from fusion_service.config import CentreConfig
 from fusion_service.service.bounded import BoundedLog
-from fusion_service.service.held import synced
 from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
+from fusion_service.service.syncing import sync_to_disk
 from fusion_service.service.young import born_in, noted
 from schemas import Message, StepLog, encode, messages
 
@@ -87,7 +87,7 @@ class LastingCentre:
         self._counts = counts
         self._restarted = restarted
         self._desk = desk
-        self._changed = False
+        self._changed = self._fresh = False
         self._saved_at = float("-inf")
         self._checkpoint = self._usable(state.load())
         self._ended, self._born = [state.ended()], [state.born()]
@@ -175,7 +175,7 @@ class LastingCentre:
         kept = saved and self._state.folder is not None
         if kept and self._state.folder is not None:
             try:
-                synced(self._state.folder)
+                sync_to_disk(self._state.folder / "checkpoint")
                 self._held.saved(self.centre.orders.next)
             except OSError as error:
                 kept = False
@@ -204,6 +204,9 @@ class LastingCentre:
         self._hold_orders()
         if self._changed and (at_once or time.monotonic() - self._saved_at >= SAVED_EVERY):
             self._keep(self.centre.checkpoint())
+        elif self._fresh:
+            self.centre.foresee()
+        self._fresh = False
 
     def _keep(self, checkpoint: bytes) -> None:
         self._checkpoint, self._changed, self._saved_at = checkpoint, False, time.monotonic()
@@ -223,7 +226,7 @@ class LastingCentre:
         sent = time.time_ns()
         tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
         payloads = {"tracks": encode(tracks, sound=True), "log": encode(journal, sound=True)}
-        self._changed = True
+        self._changed = self._fresh = True
         self._newest = max(self._newest, int(result.picture.ids.max(initial=0)))
         if checkpoint is not None:
             self._keep(checkpoint)
@@ -333,7 +336,15 @@ def _settles(result: StepResult, kind: str) -> bool:
     merged = any(heir is not None for _, _, heir in picture.ended)
     known = messages.BORN if kind == "intensity" else messages.CONFIRMED_NOW
     began = np.isin(log.decisions.kind, (known, messages.CONFIRMED_NOW)).any()
-    return bool(merged or picture.split_from or log.events or began)
+    return bool(merged or picture.split_from or any(map(_lasts, log.events)) or began)
+
+
+def _lasts(event: Mapping[str, Any]) -> bool:
+    """Whether a lost checkpoint would take back what an event tells. Not that steps were skipped, which costs most when
+    it is saved each time, and is told anew by a service that begins anew; nor that some were made again for late data,
+    where no track came back by that: what began or ended is noted."""
+    kind = event.get("kind")
+    return kind != "skipped" and (kind != "revised" or "back" in event)
 
 
 def _name_of(message: Message) -> tuple[str, str, int, int]:
