@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Floats, all_of
 from fusion_service.centre import kinship
 from fusion_service.centre.evidence import chi2_by_size
 from fusion_service.centre.extents import with_reference
@@ -122,8 +122,8 @@ def _sound_tracks(
     whole = len(parts) == 1 and len(used) > 1
     tracks = parts[0] if whole else join_tracks(parts or [intake.nothing()])
     counts = np.array([len(one.table.id) for one in used], dtype=np.intp)
-    sound = linalg.is_positive_definite(tracks.covariance) & np.isfinite(tracks.mean).all(axis=0)
-    if sound.all():
+    sound = linalg.is_positive_definite(tracks.covariance) & np.logical_and.reduce(np.isfinite(tracks.mean))
+    if all_of(sound):
         return used, counts, tracks
     ends = np.cumsum(counts)
     for one, end, count in zip(used, ends.tolist(), counts.tolist(), strict=True):
@@ -196,8 +196,8 @@ def predict_tracks(
 
 def write_back(rows: Rows, intake: Intake) -> None:
     """Put the columns of links back into the sources' own tables."""
-    start = 0
+    start, columns = 0, [getattr(rows.tracks, name) for name in LINKS]
     for name, count in rows.kept.items():
         source, part = intake.sources[name], slice(start, start + count)
-        source.tracks = altered(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINKS})
+        source.tracks = altered(source.tracks, **dict(zip(LINKS, [one[part] for one in columns], strict=True)))
         start += count

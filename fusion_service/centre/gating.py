@@ -60,11 +60,14 @@ def manoeuvred(space: tuple[str, ...], acceleration: float, seconds: Floats) -> 
 def _add_manoeuvre(spread: Floats, space: tuple[str, ...], acceleration: float, seconds: Floats) -> None:
     """Add what `manoeuvred` gives to covariances (n, n, M)."""
     gains = (0.5 * seconds**2, seconds, np.ones_like(seconds))
+    more: dict[tuple[int, int], Floats] = {}
     for axis in AXES:
-        there = [(space.index(name), gain) for name, gain in zip(axis, gains, strict=True) if name in space]
+        there = [(space.index(name), order) for order, name in enumerate(axis) if name in space]
         for i, one in there:
             for j, other in there:
-                spread[i, j] += acceleration**2 * one * other
+                if (one, other) not in more:
+                    more[one, other] = acceleration**2 * gains[one] * gains[other]
+                spread[i, j] += more[one, other]
 
 
 def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings, journal: Journal) -> Judgement:

@@ -10,7 +10,6 @@ it has published, from data that are a second old at most. The centre is told fo
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import time
 from collections import Counter
@@ -34,6 +33,7 @@ from fusion_service.centre import (
     source_of,
 )
 from fusion_service.config import CentreConfig
+from fusion_service.records import altered
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.held import synced
 from fusion_service.service.isolating import TooManyTries, culprits
@@ -204,6 +204,7 @@ class LastingCentre:
         self._hold_orders()
         if self._changed and (at_once or time.monotonic() - self._saved_at >= SAVED_EVERY):
             self._keep(self.centre.checkpoint())
+        self.centre.prepare()
 
     def _keep(self, checkpoint: bytes) -> None:
         self._checkpoint, self._changed, self._saved_at = checkpoint, False, time.monotonic()
@@ -221,7 +222,7 @@ class LastingCentre:
         result = self.centre.step(at)
         checkpoint = self.centre.checkpoint() if _settles(result, self._config.kind) else None
         sent = time.time_ns()
-        tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
+        tracks, journal = altered(result.tracks, sent=sent), altered(result.log, sent=sent)
         payloads = {"tracks": encode(tracks, sound=True), "log": encode(journal, sound=True)}
         self._changed = True
         self._newest = max(self._newest, int(result.picture.ids.max(initial=0)))
