@@ -19,6 +19,7 @@ __all__ = [
     "constant",
     "filled",
     "find_sorted",
+    "finite",
     "from_bytes",
     "marked",
     "picked",
@@ -56,6 +57,11 @@ def any_of(mask: Any) -> bool:
 def same_ids(one: NDArray[np.integer[Any]], other: NDArray[np.integer[Any]]) -> bool:
     """Whether two columns of one kind of whole numbers are the same."""
     return one.shape == other.shape and one.tobytes() == other.tobytes()
+
+
+def finite(values: Floats) -> Floats:
+    """`np.nan_to_num(values)`: themselves, no copy, where they are finite."""
+    return values if all_of(np.isfinite(values)) else np.nan_to_num(values)
 
 
 def filled(count: int | tuple[int, ...], value: Any, kind: Any) -> NDArray[Any]:

@@ -64,7 +64,8 @@ def made(kind: type[Record], values: Iterable[Any]) -> Record:
 
 def altered(record: Record, /, **new: Any) -> Record:
     """The same with other values of these fields: `dataclasses.replace`."""
-    return cast(Record, _changer(type(record), tuple(new))(record, *new.values()))
+    kind: Any = type(record)
+    return cast(Record, _changer(kind, tuple(new))(record, *new.values()))
 
 
 @cache

@@ -63,7 +63,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         return _repeated(tuple(values), kind, many) if len(tracks.id) <= KEPT else _spread(values, kind, many)
 
     whose = each([one.number for one in used], np.intp)
-    gates = [chi2_by_size(config.gate if one.said.gate is None else one.said.gate, n) for one in used]
+    gates = [config.gate if one.said.gate is None else one.said.gate for one in used]
     kin = kinship.of_rows(intake, tracks, whose)
     may_start = each([one.said.may_start and not one.treatment.out for one in used], np.bool_)
     return Rows(
@@ -73,7 +73,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         may_start=may_start & ~kinship.stale_echo(tracks, kin.echo, time, config),
         interval=tracks.interval,
         lost=each([one.source.alive is False for one in used], np.bool_),
-        gate=np.repeat(np.array(gates).T.reshape(n + 1, -1), counts, axis=1),
+        gate=_gates(tuple(gates), n, many) if len(tracks.id) <= KEPT else _gates.__wrapped__(tuple(gates), n, many),
         fresh=tracks.updated > tracks.judged,
         kept={one.source.name: count for one, count in zip(used, counts.tolist(), strict=True)},
         kin=kin,
@@ -93,6 +93,16 @@ def _repeated(values: tuple[Any, ...], kind: Any, counts: tuple[int, ...]) -> ND
     column = _spread(values, kind, counts)
     column.flags.writeable = False
     return column
+
+
+@lru_cache(maxsize=256)
+def _gates(shares: tuple[float, ...], n: int, counts: tuple[int, ...]) -> Floats:
+    """(n + 1, M): the d2 within which rows meet others, by how many components are in common, of the share of right
+    pairs that each source is to lose."""
+    gates = np.array([chi2_by_size(one, n) for one in shares]).T.reshape(n + 1, -1)
+    columns = np.repeat(gates, counts, axis=1)
+    columns.flags.writeable = False
+    return columns
 
 
 def _used(intake: Intake, time: int) -> list[_Used]:

@@ -66,10 +66,7 @@ class Deltas:
 def changed(before: GlobalTracks, after: GlobalTracks) -> NDArray[np.bool_]:
     """(T,): tracks of `after` that are not in `before`, or differ in more than what a prediction changes. Both are
     sorted by id."""
-    if same_ids(before.ids, after.ids):
-        at = np.arange(len(after.ids))
-    else:
-        at = np.searchsorted(before.ids, after.ids)
+    at = np.arange(len(after.ids)) if same_ids(before.ids, after.ids) else before.ids.searchsorted(after.ids)
     known = np.minimum(at, max(len(before.ids) - 1, 0))
     there = before.ids[known] == after.ids if len(before.ids) else np.zeros(len(after.ids), dtype=np.bool_)
     rows, old = marked(there), known[there]

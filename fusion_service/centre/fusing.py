@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, all_of, any_of, marked
+from fusion_service.arrays import Bools, Floats, Ints, all_of, any_of, finite, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
@@ -149,7 +149,7 @@ class Ruled:
         def rule(x: Floats, P: Floats, w: Floats | None, some: Ints, at: Ints) -> tuple[Floats, Floats, Floats]:
             members = self.members[which[at]][:, columns]
             fused, by[at] = self.known.fuse(self.rows, members, x, P, w, some)
-            one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
+            one, spread, gains = fused.mean, fused.covariance, finite(_influence(fused))
             bad = ~(linalg.is_positive_definite(spread) & np.logical_and.reduce(np.isfinite(one)))
             if any_of(bad):
                 self._mend(one, spread, bad, bad & ((by[at] == BY_UNION) | (name == "cu")), x, P)

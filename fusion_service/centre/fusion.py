@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among, marked, subset
+from fusion_service.arrays import among, any_of, marked, subset
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
 from fusion_service.centre.blobs import Blobs, Shared
@@ -186,11 +186,14 @@ class FusionCentre(Centre):
             picture, time, support, self.config, self._journal,
             lambda ids: self._suspended.held(rows, self._intake.names(), ids, self._intake),
         )  # fmt: skip
-        self._suspended.take(picture.take(held), self._intake, self._journal)
+        if any_of(held):
+            self._suspended.take(picture.take(held), self._intake, self._journal)
         self._note_waiting()
-        self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
-        tracks.link[among(tracks.link, picture.id[ended])] = NO_TRACK
-        self._picture = picture.take(~ended)
+        if any_of(ended):
+            self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
+            tracks.link[among(tracks.link, picture.id[ended])] = NO_TRACK
+            picture = picture.take(~ended)
+        self._picture = picture
 
     def _support(
         self, rows: Rows, shared: Shared, inside: NDArray[np.intp], at: NDArray[np.intp], count: int, time: int

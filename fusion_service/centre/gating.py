@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, among, marked, picked, subset
+from fusion_service.arrays import Bools, Floats, Ints, among, finite, marked, picked, subset
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -187,7 +187,7 @@ def _weigh(
     together[some] = size > 1
     before = subset(tracks.weighed, linked)
     weighed = fresh & together & ~jumped & (others > before)
-    more = np.where(weighed, np.nan_to_num(agreement, nan=0.0), 0.0)
+    more = np.where(weighed, finite(agreement), 0.0)
     more = np.where(fresh & ~together & ~jumped, bound / 4, more)
     more = np.where(jumped, jump, more)
     tracks.evidence[linked] = np.minimum(np.maximum(subset(tracks.evidence, linked) + more, -bound), bound)

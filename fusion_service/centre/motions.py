@@ -107,6 +107,10 @@ class Motions:
         if self._config.motion is not None:
             return np.full_like(picture.motion, -1)
         codes = np.array([-1 if motion is None else self.code(motion) for motion in declared], dtype=np.int32)
+        if len({*codes.tolist()}) == 1:
+            fed = np.zeros(len(picture.id), dtype=np.bool_)
+            fed[at] = bool(codes[0] >= 0)
+            return self._compacted(np.where(fed, codes[0], picture.motion).astype(np.int32))
         order = sorted(range(len(self.known)), key=self._noise.__getitem__)
         rank = np.full(len(self.known) + 1, -1)
         rank[order] = np.arange(len(order))
