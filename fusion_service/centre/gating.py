@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, among, finite, marked, picked, subset
+from fusion_service.arrays import Bools, Floats, Ints, among, filled, finite, marked, picked, subset
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -81,7 +81,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     outside = np.where(fresh, jumped, subset(tracks.outside, linked))
     some = marked(~outside if rows.out is None else ~outside & ~rows.out[linked])
     agreed = consensus(links[some], subset(tracks.mean, linked[some]), subset(tracks.covariance, linked[some]))
-    distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
+    distance, shared = filled(len(linked), np.nan, np.float64), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
     failed = _worst(links, fresh, distance, predicted, subset(tracks.since, linked), distance > tests.keep[shared])
     outside[failed] = True
@@ -144,7 +144,7 @@ def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings
 
 def _from_others(rows: Rows, some: Ints, agreed: Consensus, tests: Tests) -> tuple[Floats, Ints]:
     """d2 (S,) of each row to the others of its track, NaN where it is alone, and over how many components."""
-    distance, size = np.full(len(some), np.nan), np.zeros(len(some), dtype=np.intp)
+    distance, size = filled(len(some), np.nan, np.float64), np.zeros(len(some), dtype=np.intp)
     mean, covariance = rows.tracks.mean, rows.tracks.covariance
     for members in agreed.groups:
         if members.shape[1] < 2:
@@ -181,7 +181,7 @@ def _weigh(
 ) -> None:  # fmt: skip
     """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
     tracks, fresh = rows.tracks, subset(rows.fresh, linked)
-    others = np.full(len(linked), -1, dtype=np.int64)
+    others = filled(len(linked), -1, np.int64)
     others[some] = _newest_other(groups, tracks.updated[linked[some]])
     together = np.zeros(len(linked), dtype=np.bool_)
     together[some] = size > 1
@@ -196,7 +196,7 @@ def _weigh(
 
 def _newest_other(groups: list[Ints], updated: NDArray[np.int64]) -> NDArray[np.int64]:
     """For each row the newest datum of the other rows of its track, -1 without any; groups as of `Consensus`."""
-    out = np.full(len(updated), -1, dtype=np.int64)
+    out = filled(len(updated), -1, np.int64)
     for members in groups:
         if members.shape[1] == 2:
             out[members] = updated[members[:, ::-1]]
