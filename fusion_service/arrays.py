@@ -44,8 +44,8 @@ SPARSE = 8
 
 
 def all_of(mask: Any) -> bool:
-    """Whether a mask holds for all: `mask.all()` at a quarter of its price where rows are few, which it is asked of some
-    forty times a step."""
+    """Whether a mask holds for all: `mask.all()` at a quarter of its price where rows are few; some forty times a
+    step."""
     return b"\0" not in mask.tobytes()
 
 

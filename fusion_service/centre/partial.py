@@ -61,7 +61,7 @@ class Unknown:
         known = np.empty(covariance.shape[1:], dtype=np.bool_)
         known.fill(True)
         for k, limit in self.limits:
-            np.logical_not(covariance[k, k] >= limit, out=known[k])
+            known[k] = ~(covariance[k, k] >= limit)
         return known
 
     def told(self, covariance: Floats) -> Floats:

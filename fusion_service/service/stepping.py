@@ -310,6 +310,7 @@ class LastingCentre:
             result = centre.step(at)
             encode(result.tracks)
             encode(result.log)
+            result.settle()
             centre.checkpoint()
         except Exception:
             return True
