@@ -132,8 +132,7 @@ def test_by_short_cuts_and_without_them_are_the_same(
 
 
 def test_a_status_is_the_same_whenever_it_is_asked_for_and_a_checkpoint_made_ahead() -> None:
-    settings = {"lateness": 1.0}
-    assert different(flown(True, **settings), flown(True, asks=False, prepares=True, **settings)) == []
+    assert different(flown(True, lateness=1.0), flown(True, asks=False, prepares=True, lateness=1.0)) == []
 
 
 def test_a_status_that_cannot_be_made_harms_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
