@@ -13,12 +13,17 @@ __all__ = [
     "Bools",
     "Floats",
     "Ints",
+    "all_of",
     "among",
+    "any_of",
     "constant",
+    "filled",
     "find_sorted",
+    "finite",
     "from_bytes",
     "marked",
     "picked",
+    "same_ids",
     "subset",
     "to_bytes",
 ]
@@ -36,6 +41,34 @@ SMALL = 4096
 """Comparisons of each with each, up to which they are quicker than sorting."""
 SPARSE = 8
 """Numbers of the span of ids for each of them, up to which a table is worth its room."""
+
+
+def all_of(mask: Any) -> bool:
+    """Whether a mask holds for all: `mask.all()` at a quarter of its price where rows are few; some forty times a
+    step."""
+    return b"\0" not in mask.tobytes()
+
+
+def any_of(mask: Any) -> bool:
+    """Whether a mask holds for any, likewise."""
+    return b"\1" in mask.tobytes()
+
+
+def same_ids(one: NDArray[np.integer[Any]], other: NDArray[np.integer[Any]]) -> bool:
+    """Whether two columns of one kind of whole numbers are the same."""
+    return one.shape == other.shape and one.tobytes() == other.tobytes()
+
+
+def finite(values: Floats) -> Floats:
+    """`np.nan_to_num(values)`: themselves, no copy, where they are finite."""
+    return values if all_of(np.isfinite(values)) else np.nan_to_num(values)
+
+
+def filled(count: int | tuple[int, ...], value: Any, kind: Any) -> NDArray[Any]:
+    """`np.full(count, value, kind)` (K,) without what that does beside it."""
+    column = np.empty(count, kind)
+    column.fill(value)
+    return column
 
 
 def find_sorted(ids: NDArray[np.uint64], some: NDArray[np.uint64]) -> Ints:

@@ -265,9 +265,10 @@ def is_positive_definite(P: Floats, tolerance: float = 1e-14) -> Bools:
     with np.errstate(all="ignore"):
         d = _pivots(P)
         if d[0].size < FEW:
-            diagonal = range(len(d))
-            fine = (d > tolerance * P[diagonal, diagonal]) & (d > 0.0) & np.isfinite(d)
-            return np.asarray(fine.all(axis=0))
+            diagonal = _diagonal(P) if P.ndim == 3 else P[range(len(d)), range(len(d))]
+            fine = d > np.maximum(tolerance * diagonal, 0.0)
+            fine &= d < np.inf
+            return np.asarray(np.logical_and.reduce(fine))
         good: Bools = np.ones(P.shape[2:], dtype=np.bool_)
         for k in range(len(d)):
             good &= d[k] > tolerance * P[k, k]

@@ -22,10 +22,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import lru_cache
 from math import factorial
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Floats, all_of, any_of
 from fusion_service.linalg import congruence, matvec
 from fusion_service.turn import turn, turns
 from schemas import Frame, Motion
@@ -54,10 +56,10 @@ def predict(
     the states, of which a turn asks where up is.
     Raises ValueError for a negative or NaN `dt`.
     """
-    if not np.any(dt):
+    if not dt.any():
         return means.copy(), covariances.copy()
     turning = motion.kind == "ct" and turns(space, frame)
-    once = not turning and dt.ndim == 1 and bool((dt == dt[0]).all())
+    once = not turning and dt.ndim == 1 and all_of(dt == dt[0])
     moves, noise = _at_once(motion, space, float(dt[0])) if once else transition(motion, space, means, dt, frame)
     with np.errstate(all="ignore"):
         if turning:
@@ -72,6 +74,8 @@ def predict(
     if once:
         return predicted, spread
     same = dt == 0
+    if not any_of(same):
+        return predicted, spread
     return np.where(same, means, predicted), np.where(same, covariances, spread)
 
 
@@ -102,7 +106,7 @@ def transition(
 
     In every kind q_turn dt is added on a turn rate. Raises ValueError for a negative or NaN `dt`.
     """
-    if not np.all(dt >= 0):
+    if not all_of(dt >= 0):
         raise ValueError(BACK)
     with np.errstate(all="ignore"):
         moves, noise = _kinematics(motion, space, np.ascontiguousarray(dt))
@@ -115,6 +119,8 @@ def _kinematics(motion: Motion, space: tuple[str, ...], dt: Floats) -> tuple[Flo
     """F and Q (n, n, B) of every kind, a turn's being those of cv."""
     n = len(space)
     moves, noise = np.zeros((n, n, *dt.shape)), np.zeros((n, n, *dt.shape))
+    if dt.ndim == 1 and (plan := _driven(motion, space)) is not None:
+        return _filled(moves, noise, plan, dt)
     moves[range(n), range(n)] = 1.0
     powers = [np.ones_like(dt)]
     for _ in range(5):
@@ -133,6 +139,61 @@ def _kinematics(motion: Motion, space: tuple[str, ...], dt: Floats) -> tuple[Flo
     if "turn_rate" in space:
         i = space.index("turn_rate")
         noise[i, i] = motion.q_turn * dt
+    return moves, noise
+
+
+class _Plan(NamedTuple):
+    """Which elements of F and Q hold what of the powers of dt, each column (K,): rows, columns, the power, and what it
+    is divided by, or multiplied. top: the highest power."""
+
+    diagonal: NDArray[np.intp]
+    moves: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]
+    noise: tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]
+    top: int
+
+
+@lru_cache(maxsize=256)
+def _driven(motion: Motion, space: tuple[str, ...]) -> _Plan | None:
+    """What `_drive` writes for all chains together; None for motions that say more than that."""
+    if motion.kind not in ("cv", "ca", "ct") or "turn_rate" in space:
+        return None
+    moves: list[tuple[int, int, int, float]] = []
+    noise: list[tuple[int, int, int, float]] = []
+    for chain, first in _chains(space):
+        last = first + len(chain) - 1
+        top = 2 if motion.kind == "ca" else last
+        if top > last and motion.sigma:
+            return None
+        above = top - first
+        for i, row in enumerate(chain):
+            for j, column in enumerate(chain):
+                a, b = above - i, above - j
+                if j > i:
+                    moves.append((row, column, j - i, float(factorial(j - i))))
+                noise.append((row, column, a + b + 1, motion.q / ((a + b + 1) * factorial(a) * factorial(b))))
+    top = max([1, *(one[2] for one in noise)])
+    return _Plan(np.arange(len(space)), _columns(moves), _columns(noise), top)
+
+
+def _columns(
+    entries: list[tuple[int, int, int, float]],
+) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], Floats]:
+    whole = np.array([entry[:3] for entry in entries], dtype=np.intp).reshape(-1, 3)
+    return whole[:, 0].copy(), whole[:, 1].copy(), whole[:, 2].copy(), np.array([[entry[3]] for entry in entries])
+
+
+def _filled(moves: Floats, noise: Floats, plan: _Plan, dt: Floats) -> tuple[Floats, Floats]:
+    """`_kinematics` by a plan: the same operations on all elements at once."""
+    powers = np.empty((plan.top + 1, len(dt)))
+    powers[0] = 1.0
+    for k in range(plan.top):
+        np.multiply(powers[k], dt, out=powers[k + 1])
+    moves[plan.diagonal, plan.diagonal] = 1.0
+    row, column, power, factor = plan.moves
+    if len(row):
+        moves[row, column] = powers[power] / factor
+    row, column, power, factor = plan.noise
+    noise[row, column] = factor * powers[power]
     return moves, noise
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import fields
 from functools import cache
 from operator import attrgetter
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 __all__ = ["altered", "columns_of", "made", "names_of"]
 
@@ -65,8 +65,24 @@ def made(kind: type[Record], values: Iterable[Any]) -> Record:
 def altered(record: Record, /, **new: Any) -> Record:
     """The same with other values of these fields: `dataclasses.replace`."""
     kind: Any = type(record)
-    values = list(columns_of(record))
-    for place, value in zip(_places(kind, tuple(new)), new.values(), strict=True):
-        values[place] = value
-    new_one: Record = made(kind, values)
-    return new_one
+    return cast(Record, _changer(kind, tuple(new))(record, *new.values()))
+
+
+@cache
+def _changer(kind: Any, changed: tuple[str, ...]) -> Callable[..., Any]:
+    """What makes a record from another and the values of `changed`, in this order: written out field by field, at
+    half the price of a loop over them."""
+    names, places, setters = names_of(kind), _places(kind, changed), _setters(kind)
+    values = {name: f"new{number}" for number, name in enumerate(changed)}
+    given = [values.get(name, f"old.{name}") for name in names]
+    if setters is None:
+        body = f"return kind({', '.join(given)})"
+    else:
+        puts = [f"put{number}(one, {value})" for number, value in enumerate(given)]
+        body = "\n    ".join(["one = new(kind)", *puts, "return one"])
+    scope: dict[str, Any] = {"kind": kind, "new": object.__new__}
+    scope |= {f"put{number}": put for number, put in enumerate(setters or ())}
+    arguments = ", ".join(["old", *(f"new{number}" for number in range(len(places)))])
+    exec(f"def change({arguments}):\n    {body}\n", scope)
+    change: Callable[..., Any] = scope["change"]
+    return change

@@ -28,6 +28,8 @@ MAX_MEAN = 1e12
 VARIANCES = (1e-20, 1e24)
 PIVOT = 1e-14
 WEIGHT_SUM = 1e-6
+FEW = 256
+"""Densities up to which calls cost more than what is done in them."""
 BLOCK = 2048
 """Densities factorised at a time: what fits the cache."""
 
@@ -101,6 +103,10 @@ def _sound(means: Floats, covariances: Floats) -> NDArray[np.bool_]:
         variance = covariances[:, k, k]
         pivot = rest[k, k]
         good &= (variance >= VARIANCES[0]) & (variance <= VARIANCES[1]) & (pivot > PIVOT * variance)
+        if len(means) <= FEW:  # the upper triangle too, in fewer calls
+            below = rest[k + 1 :, k]
+            rest[k + 1 :, k + 1 :] -= (below / pivot)[:, None] * below
+            continue
         for i in range(k + 1, n):
             factor = rest[i, k] / pivot
             for j in range(k + 1, i + 1):

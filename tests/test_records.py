@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among, subset
+from fusion_service.arrays import all_of, among, any_of, filled, finite, same_ids, subset
 from fusion_service.centre.association import by_size
 from fusion_service.centre.gating import _newest_other
 from fusion_service.centre.tracks import LINKS, Tracks, empty_tracks, renewed, unlinked
@@ -105,3 +105,40 @@ def test_a_report_of_the_same_tracks_is_as_one_that_lists_another_beside_them() 
 
 def _columns(table: Tracks) -> dict[str, NDArray[Any]]:
     return dict(zip(names_of(Tracks), columns_of(table), strict=True))
+
+
+def test_a_record_of_many_kinds_is_made_over() -> None:
+    @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
+    class Named:
+        kind: str
+        new: int
+        old: int = 3
+
+    named = Named(kind="a", new=1)
+    assert altered(named, old=4, kind="b") == Named(kind="b", new=1, old=4)
+    assert altered(altered(named, new=7), new=8, old=9) == Named(kind="a", new=8, old=9)
+    assert altered(named) == named
+    assert altered(named) is not named
+
+
+@pytest.mark.parametrize("shape", [(0,), (1,), (40,), (3, 5), (0, 4)])
+def test_masks_are_looked_at_by_their_bytes(shape: tuple[int, ...]) -> None:
+    rng = np.random.default_rng(len(shape))
+    for share in (0.0, 0.1, 0.9, 1.0):
+        mask = rng.random(shape) < share
+        for one in (mask, ~mask, mask[..., ::2], mask.T):
+            assert all_of(one) is bool(one.all())
+            assert any_of(one) is bool(one.any())
+
+
+def test_columns_that_are_the_same_filled_and_finite() -> None:
+    ids = np.arange(9, dtype=np.uint64)
+    assert same_ids(ids, ids.copy())
+    assert same_ids(ids[:0], ids[:0])
+    assert same_ids(ids[::2], ids[::2].copy())
+    assert not same_ids(ids, ids[:-1])
+    assert not same_ids(ids, ids[::-1])
+    np.testing.assert_array_equal(filled((2, 3), -1, np.int64), np.full((2, 3), -1))
+    values = np.array([1.0, np.nan, np.inf, -np.inf])
+    np.testing.assert_array_equal(finite(values), np.nan_to_num(values))
+    assert finite(values[:1]).base is values

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats
+from fusion_service.arrays import Floats, all_of
 from fusion_service.centre import kinship
 from fusion_service.centre.evidence import chi2_by_size
 from fusion_service.centre.extents import with_reference
@@ -63,7 +63,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         return _repeated(tuple(values), kind, many) if len(tracks.id) <= KEPT else _spread(values, kind, many)
 
     whose = each([one.number for one in used], np.intp)
-    gates = [chi2_by_size(config.gate if one.said.gate is None else one.said.gate, n) for one in used]
+    gates = [config.gate if one.said.gate is None else one.said.gate for one in used]
     kin = kinship.of_rows(intake, tracks, whose)
     may_start = each([one.said.may_start and not one.treatment.out for one in used], np.bool_)
     return Rows(
@@ -73,7 +73,7 @@ def usable_rows(intake: Intake, time: int, journal: Journal) -> Rows:
         may_start=may_start & ~kinship.stale_echo(tracks, kin.echo, time, config),
         interval=tracks.interval,
         lost=each([one.source.alive is False for one in used], np.bool_),
-        gate=np.repeat(np.array(gates).T.reshape(n + 1, -1), counts, axis=1),
+        gate=_gates(tuple(gates), n, many) if len(tracks.id) <= KEPT else _gates.__wrapped__(tuple(gates), n, many),
         fresh=tracks.updated > tracks.judged,
         kept={one.source.name: count for one, count in zip(used, counts.tolist(), strict=True)},
         kin=kin,
@@ -93,6 +93,16 @@ def _repeated(values: tuple[Any, ...], kind: Any, counts: tuple[int, ...]) -> ND
     column = _spread(values, kind, counts)
     column.flags.writeable = False
     return column
+
+
+@lru_cache(maxsize=256)
+def _gates(shares: tuple[float, ...], n: int, counts: tuple[int, ...]) -> Floats:
+    """(n + 1, M): the d2 within which rows meet others, by how many components are in common, of the share of right
+    pairs that each source is to lose."""
+    gates = np.array([chi2_by_size(one, n) for one in shares]).T.reshape(n + 1, -1)
+    columns = np.repeat(gates, counts, axis=1)
+    columns.flags.writeable = False
+    return columns
 
 
 def _used(intake: Intake, time: int) -> list[_Used]:
@@ -122,8 +132,8 @@ def _sound_tracks(
     whole = len(parts) == 1 and len(used) > 1
     tracks = parts[0] if whole else join_tracks(parts or [intake.nothing()])
     counts = np.array([len(one.table.id) for one in used], dtype=np.intp)
-    sound = linalg.is_positive_definite(tracks.covariance) & np.isfinite(tracks.mean).all(axis=0)
-    if sound.all():
+    sound = linalg.is_positive_definite(tracks.covariance) & np.logical_and.reduce(np.isfinite(tracks.mean))
+    if all_of(sound):
         return used, counts, tracks
     ends = np.cumsum(counts)
     for one, end, count in zip(used, ends.tolist(), counts.tolist(), strict=True):
@@ -196,8 +206,8 @@ def predict_tracks(
 
 def write_back(rows: Rows, intake: Intake) -> None:
     """Put the columns of links back into the sources' own tables."""
-    start = 0
+    start, columns = 0, [getattr(rows.tracks, name) for name in LINKS]
     for name, count in rows.kept.items():
         source, part = intake.sources[name], slice(start, start + count)
-        source.tracks = altered(source.tracks, **{name: getattr(rows.tracks, name)[part] for name in LINKS})
+        source.tracks = altered(source.tracks, **dict(zip(LINKS, [one[part] for one in columns], strict=True)))
         start += count

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterator
+from functools import lru_cache
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints, marked
+from fusion_service.arrays import Floats, Ints, all_of, marked
 from fusion_service.densities import Mixtures, log_sum
 
 __all__ = [
@@ -46,6 +47,8 @@ TIERS = (8, 64)
 CROWDED = TIERS[-1]
 CROWD = 256
 """Partners sought of a crowded row, shared evenly between the sources."""
+FEW = 512
+"""Labels up to which groups of them are kept."""
 CHUNK = 4096
 """Rows or pairs worked on at a time: bounds memory, and how long a signal has to wait."""
 
@@ -55,16 +58,32 @@ def by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
 
     Groups come in order of label within a size, rows in their own order within a group.
     """
+    if len(labels) > FEW or labels.dtype != np.uint64:
+        yield from _by_size(labels)
+    elif len(labels):
+        yield from _few_by_size(labels.tobytes())
+
+
+@lru_cache(maxsize=64)
+def _few_by_size(labels: bytes) -> tuple[tuple[Any, Ints], ...]:
+    """The same of few: a step asks it several times of the same, and the next step again."""
+    groups = tuple(_by_size(np.frombuffer(labels, dtype=np.uint64)))
+    for column in (column for group in groups for column in group):
+        column.flags.writeable = False
+    return groups
+
+
+def _by_size(labels: NDArray[Label]) -> Iterator[tuple[NDArray[Label], Ints]]:
     if not len(labels):
         return
-    order = np.argsort(labels, kind="stable")
+    order = labels.argsort(kind="stable")
     ranked = labels[order]
     new = marked(ranked[1:] != ranked[:-1])
     edges = np.zeros(len(new) + 2, dtype=np.intp)
     edges[1:-1], edges[-1] = new + 1, len(labels)
     starts, counts = edges[:-1], edges[1:] - edges[:-1]
     unique, size = ranked[starts], int(counts[0])
-    if (counts == size).all():
+    if all_of(counts == size):
         yield unique, order.reshape(len(unique), size)
         return
     for k in marked(np.bincount(counts)).tolist():

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Ints, from_bytes, marked, to_bytes
+from fusion_service.arrays import Bools, Ints, filled, from_bytes, marked, same_ids, to_bytes
 from fusion_service.centre.extents import BLOB, shaped, widened
 from fusion_service.centre.lifecycle import Picture
 from fusion_service.centre.rows import Rows
@@ -217,8 +217,8 @@ class Blobs:
         shared = Shared(rows, now, self._config, frame)
         linked, was, lost = rows.linked(), self._followed, self._lost
         source, track, local = rows.source[linked], rows.tracks.link[linked], rows.tracks.id[linked]
-        times = np.full(len(linked), time, dtype=np.int64)
-        same = self._names == names and np.array_equal(was.track, track) and np.array_equal(was.source, source)
+        times = filled(len(linked), time, np.int64)
+        same = self._names == names and same_ids(was.track, track) and same_ids(was.source, source)
         if same:
             links = _Links(source, track, local, was.since, times)
         else:

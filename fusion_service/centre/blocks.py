@@ -26,7 +26,7 @@ from typing import TypeAlias
 import numpy as np
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, all_of
 from fusion_service.centre.partial import Unknown
 
 __all__ = ["Fusing", "fuse_known"]
@@ -43,7 +43,7 @@ def fuse_known(
     information form or not: mean (n, B), covariance (n, n, B), padded where no source knows, influences (N, B)."""
     N, n, count = means.shape
     known = unknown.known(covariances.transpose(1, 2, 0, 3))
-    if known.all():
+    if all_of(known):
         return rule(means, covariances, weights, np.arange(n), np.arange(count))
     one, spread, gains = np.zeros((n, count)), np.zeros((n, n, count)), np.zeros((N, count))
     spread[range(n), range(n)] = unknown.pad[:, None]

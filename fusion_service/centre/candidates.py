@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints, among, marked, picked
-from fusion_service.centre.association import overlap
+from fusion_service.arrays import Floats, Ints, all_of, among, filled, marked, picked
+from fusion_service.centre.association import CROWDED, overlap
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.gating import Judgement
 from fusion_service.centre.identity import Terms
@@ -30,6 +30,8 @@ from fusion_service.records import altered, columns_of
 
 __all__ = ["Candidates", "Pairs", "find_candidates"]
 
+FEW = CROWDED
+"""Tracks up to which it is looked first whether any of them are near each other."""
 MOST_RIVALS = 32
 """Tracks near its own that a believed row may be exchanged to, the nearest: bounds a step where all tracks coincide."""
 
@@ -83,7 +85,11 @@ def find_candidates(
         mean, covariance, at = now.mean.copy(), now.covariance.copy(), now.find(agreed.labels)
         mean[:, at], covariance[:, :, at] = agreed.mean, agreed.covariance
     loose = marked(rows.fresh & ((tracks.link == NO_TRACK) | tracks.outside) & ~meeting.held)
-    known = marked(now.time >= 0)
+    there = now.time >= 0
+    if not len(loose) and all_of(there) and _far_apart(mean, covariance, now, tests, places, beside):
+        own = np.full(len(tracks.id), np.nan)
+        return Candidates(NO_PAIRS, NO_PAIRS, NO_PAIRS, NO_PAIRS, own, loose, mean, covariance)
+    known = marked(there)
     means, covariances = (mean, covariance) if len(known) == len(now.id) else (mean[:, known], covariance[..., known])
     if len(loose):
         means = np.concatenate([means, picked(tracks.mean, loose)], axis=1)
@@ -120,6 +126,19 @@ def find_candidates(
     gg = altered(pairs_gg, first=known[pairs_gg.first], second=known[pairs_gg.second])
     rr = altered(pairs_rr, first=node[pairs_rr.first], second=node[pairs_rr.second])
     return _said(Candidates(gg, joins, rivals, rr, own, loose, mean, covariance), rows, now, meeting)
+
+
+def _far_apart(
+    mean: Floats, covariance: Floats, now: Picture, tests: Tests, places: list[int], beside: Neighbours
+) -> bool:
+    """Whether few global tracks, between which and no row there is anything to decide, are too far from each other to
+    meet: what `find_candidates` would find, without the rest of its work."""
+    count = len(now.id)
+    if not 0 < count < FEW or not all_of(tests.unknown.known(covariance)):
+        return False
+    sigma = np.sqrt(sum(covariance[place, place] for place in places))
+    reach = float(np.sqrt(tests.gate.max()))
+    return not len(beside.pairs(now.id, mean[places], sigma, reach, filled(count, -1, np.intp))[0])
 
 
 def _said(near: Candidates, rows: Rows, now: Picture, meeting: Meeting) -> Candidates:

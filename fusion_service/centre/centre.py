@@ -12,7 +12,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -36,24 +36,15 @@ from fusion_service.centre.obeying import heirs, obey, view_of
 from fusion_service.centre.orders import Orders
 from fusion_service.centre.publishing import Contributions, picture_message
 from fusion_service.centre.quieting import rest
+from fusion_service.centre.result import StepResult
 from fusion_service.centre.revising import Revision
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.status import step_status
 from fusion_service.config import CentreConfig, centre_config, config_hash
 from fusion_service.order import Order
-from schemas import GlobalTracks, Status, StepLog, messages
+from schemas import Status, StepLog, messages
 
-__all__ = ["Centre", "StepResult"]
-
-
-@dataclass(frozen=True, slots=True)
-class StepResult:
-    """What one step gives. tracks: as they are published, which may be a delta; picture: all of them."""
-
-    tracks: GlobalTracks
-    log: StepLog
-    status: Status
-    picture: GlobalTracks
+__all__ = ["Centre"]
 
 
 class Centre(ABC):
@@ -90,6 +81,7 @@ class Centre(ABC):
         self._journal = Journal(self.config.name, self.config_hash, __version__)
         self._era = EraWatch(self.config)
         self._deltas = Deltas(self.config)
+        self._newest: StepResult | None = None
         self._begin()
         if checkpoint is not None:
             state, self._picture = unpack_state(checkpoint, self._intake, self._labels)
@@ -113,6 +105,7 @@ class Centre(ABC):
     def handle(self, event: Event, received: int) -> None:
         """Queue a message or another event for the next step; `received` is when it came, ns. Never raises
         for what a message contains: it is checked, and refused with a reason, in the step."""
+        self._settle()
         era = self._era.judge(event, received, self._time)
         if era is not None:
             self._begin_era(era, received)
@@ -137,6 +130,7 @@ class Centre(ABC):
         """Make the step at `time`, ns, which must be after the last. `ValueError` if it is not."""
         if time <= self._time:
             raise ValueError(f"a step at {time} is not after the last, at {self._time}")
+        self._settle()
         revised = self._revise()
         contributions = self._make(time)
         journal = self._journal
@@ -156,9 +150,20 @@ class Centre(ABC):
         tracks = self._deltas.of(picture, self._intake.sources.values())
         log = journal.write(self.epoch, self._published, self._step, time)
         self._published += 1
-        notes = self._era.notes(time)
+        self._newest = StepResult(tracks, log, lambda: self._status(log), picture)
+        return self._newest
+
+    def _status(self, log: StepLog) -> Status:
+        """After the step of this log."""
+        notes, journal = self._era.notes(log.time), self._journal
         status = step_status(self._intake, journal, log, self._numbers(), self.refusals(), notes, self._watched())
-        return StepResult(tracks, log, self._history.told_in(status), picture)
+        return self._history.told_in(status)
+
+    def _settle(self) -> None:
+        """What is told of the last step is made now, if it is not yet."""
+        newest, self._newest = self._newest, None
+        if newest is not None:
+            newest.settle()
 
     def _make(self, time: int, events: tuple[tuple[Event, int], ...] | None = None, left: int = 0) -> Contributions:
         """Make the step at `time`, ns, as far as it changes the state, and remember what went into it. events: of a
@@ -281,6 +286,7 @@ class Centre(ABC):
 
     def let_go(self, tracks: NDArray[np.uint64]) -> int:
         """Forget global tracks that have ended since the checkpoint that this centre was made from; how many it had."""
+        self._settle()
         gone = np.isin(self._picture.id, tracks)
         self._forget(self._picture.id[gone].tolist())
         self._ids.promised.drop(tracks.tolist())

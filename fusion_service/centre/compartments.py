@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among, find_sorted, marked
+from fusion_service.arrays import among, any_of, filled, find_sorted, marked
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.sources import Source
@@ -58,7 +58,7 @@ class Compartments:
         if len(still):
             apart = np.where(among(apart, still), apart, NONE).astype(np.int32)
         else:
-            apart = np.full(len(ids), NONE, dtype=np.int32)
+            apart = filled(len(ids), NONE, np.int32)
         self.track, self.origin, self.apart = ids, origin, apart
         if not len(still) and len(self._names.texts) > len(ORIGINS):
             self._names = Words()
@@ -73,13 +73,13 @@ class Compartments:
     def _rows_apart(self, rows: Rows, names: tuple[str, ...]) -> Codes:
         quarantined = self._intake.orders.about("quarantine")
         if not quarantined:
-            return np.full(len(rows.source), NONE, dtype=np.int32)
+            return filled(len(rows.source), NONE, np.int32)
         codes = self._names.codes([name if name in quarantined else None for name in names])
         return codes[rows.source] if len(codes) else np.zeros(0, dtype=np.int32)
 
     def _now(self, ids: Ids, rows: Rows, names: tuple[str, ...]) -> tuple[Origins, Codes]:
-        origin, apart = np.zeros(len(ids), dtype=np.uint8), np.full(len(ids), NONE, dtype=np.int32)
-        plain = not (self.origin.any() or rows.tracks.origin.any() or (self.apart != NONE).any())
+        origin, apart = np.zeros(len(ids), dtype=np.uint8), filled(len(ids), NONE, np.int32)
+        plain = not (self.origin.any() or rows.tracks.origin.any() or any_of(self.apart != NONE))
         if not len(ids) or (plain and not self._intake.orders.about("quarantine")):
             return origin, apart
         if len(self.track):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Floats, Ints, marked, picked
+from fusion_service.arrays import Floats, Ints, filled, marked, picked
 from fusion_service.centre.association import SOUND as SOUND_ALONE
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.compiled.either import FAST
@@ -45,10 +45,11 @@ def consensus(labels: NDArray[np.uint64], means: Floats, covariances: Floats) ->
     """
     count = means.shape[1]
     sized = list(by_size(labels))
-    partner, size = np.full(count, -1), np.ones(count, dtype=np.intp)
+    partner, size = filled(count, -1, np.intp), np.ones(count, dtype=np.intp)
     more: list[tuple[Ints, Floats, Floats]] = []
     compiled = "intersect" in FAST
-    others = (np.full(means.shape, np.nan), np.full(covariances.shape, np.nan)) if compiled else None
+    blank = np.nan, np.float64
+    others = (filled(means.shape, *blank), filled(covariances.shape, *blank)) if compiled else None
     parts: list[tuple[Floats, Floats]] = [(means[:, :0], covariances[..., :0])]
     for _, rows in sized:
         k = rows.shape[1]

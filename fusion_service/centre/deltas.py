@@ -10,14 +10,14 @@ or its contributors are others than before (see `schemas.merged` for the reader'
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among, marked
+from fusion_service.arrays import all_of, among, marked, same_ids
 from fusion_service.centre.sources import Source
 from fusion_service.config import CentreConfig
+from fusion_service.records import altered
 from schemas import GlobalTracks, tracks_at
 
 __all__ = ["Deltas", "fed"]
@@ -52,21 +52,21 @@ class Deltas:
         if before is None or picture.revised is not None or picture.time // self._period != before.time // self._period:
             return picture
         ended = np.array([track for track, _, _ in picture.ended], dtype=np.uint64)
-        same = len(before.ids) == len(picture.ids) and bool((before.ids == picture.ids).all())
+        same = same_ids(before.ids, picture.ids)
         gone = before.ids[:0] if same else np.setdiff1d(before.ids, picture.ids, assume_unique=True)
         if (before.space, before.frame) != (picture.space, picture.frame) or not among(gone, ended).all():
             return picture
-        rows = marked(among(picture.ids, fed(sources)) | changed(before, picture))
-        return replace(tracks_at(picture, rows), delta=True)
+        which = among(picture.ids, fed(sources))
+        if all_of(which):
+            return altered(picture, delta=True)
+        rows = marked(which | changed(before, picture))
+        return altered(tracks_at(picture, rows), delta=True)
 
 
 def changed(before: GlobalTracks, after: GlobalTracks) -> NDArray[np.bool_]:
     """(T,): tracks of `after` that are not in `before`, or differ in more than what a prediction changes. Both are
     sorted by id."""
-    if len(before.ids) == len(after.ids) and (before.ids == after.ids).all():
-        at = np.arange(len(after.ids))
-    else:
-        at = np.searchsorted(before.ids, after.ids)
+    at = np.arange(len(after.ids)) if same_ids(before.ids, after.ids) else before.ids.searchsorted(after.ids)
     known = np.minimum(at, max(len(before.ids) - 1, 0))
     there = before.ids[known] == after.ids if len(before.ids) else np.zeros(len(after.ids), dtype=np.bool_)
     rows, old = marked(there), known[there]

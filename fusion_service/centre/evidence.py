@@ -84,7 +84,7 @@ class Tests:
 
     def _beyond(self, distance: Floats, size: Ints) -> Floats:
         keep = self.keep[size]
-        return np.clip((distance - keep) / (FAR * keep), 0.0, 1.0)
+        return np.minimum(np.maximum((distance - keep) / (FAR * keep), 0.0), 1.0)
 
     def sameness(self, distance: Floats, size: Ints) -> Floats:
         """What a datum adds to the sum for a merge of two global tracks at d2 `distance`."""

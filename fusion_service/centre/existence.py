@@ -117,7 +117,7 @@ def update_existence(
     fresh = rows.fresh[inside]
     says = np.isfinite(rows.tracks.existence[inside])
     hit = np.bincount(at[fresh], minlength=count) > 0
-    opinion = np.where(np.isnan(picture.opinion), _logit(config.birth_existence), picture.opinion)
+    opinion = np.where(np.isnan(picture.opinion), _begun(config.birth_existence), picture.opinion)
     evidence = picture.evidence.copy()
     opinion = _opinions(rows, picture, inside[says], opinion, config.existence, Unknown.of(config.space))
     said = (intake.declared(source) for _, source in sorted(intake.sources.items()))
@@ -217,8 +217,14 @@ def _missed(
     return whole, spent
 
 
+@lru_cache(maxsize=64)
+def _begun(r: float) -> float:
+    """The log-odds of what a track begins with."""
+    return float(_logit(r))
+
+
 def _logit(r: Any) -> Any:
-    r = np.clip(r, 1e-12, 1 - 1e-12)
+    r = np.minimum(np.maximum(r, 1e-12), 1 - 1e-12)
     return np.log(r) - np.log1p(-r)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, marked
+from fusion_service.arrays import Bools, Floats, Ints, all_of, any_of, finite, marked
 from fusion_service.centre import kinship
 from fusion_service.centre.association import by_size, uniform_ci
 from fusion_service.centre.blocks import fuse_known
@@ -115,12 +115,12 @@ def _gaussian(
         related = kinship.is_related(rows, members)
     by = np.zeros(len(members), dtype=np.uint8)
     ruled = Ruled(rows, members, known, unknown, journal)
-    if len(related) and related.all():
+    if len(related) and all_of(related):
         one, spread, gains = ruled.kin(means, covariances)
     else:
         weights = _shares(rows, members) if config.rule == "aa" and not config.rule_options else None
         one, spread, gains = ruled.fuse(means, covariances, weights, np.arange(len(members)), by)
-        if related.any():
+        if any_of(related):
             some = Ruled(rows, members[related], known, unknown, journal)
             one[:, related], spread[:, :, related], gains[:, related] = some.kin(
                 means[..., related], covariances[..., related]
@@ -149,9 +149,9 @@ class Ruled:
         def rule(x: Floats, P: Floats, w: Floats | None, some: Ints, at: Ints) -> tuple[Floats, Floats, Floats]:
             members = self.members[which[at]][:, columns]
             fused, by[at] = self.known.fuse(self.rows, members, x, P, w, some)
-            one, spread, gains = fused.mean, fused.covariance, np.nan_to_num(_influence(fused))
-            bad = ~(linalg.is_positive_definite(spread) & np.isfinite(one).all(axis=0))
-            if bad.any():
+            one, spread, gains = fused.mean, fused.covariance, finite(_influence(fused))
+            bad = ~(linalg.is_positive_definite(spread) & np.logical_and.reduce(np.isfinite(one)))
+            if any_of(bad):
                 self._mend(one, spread, bad, bad & ((by[at] == BY_UNION) | (name == "cu")), x, P)
                 gains[:, bad] = 1.0 / len(x)
             return one, spread, gains

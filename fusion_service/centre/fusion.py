@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import among, marked, subset
+from fusion_service.arrays import among, any_of, filled, marked, subset
 from fusion_service.centre import kinship
 from fusion_service.centre.align import write_back
 from fusion_service.centre.blobs import Blobs, Shared
@@ -175,7 +175,7 @@ class FusionCentre(Centre):
         tracks, picture, inside = rows.tracks, self._picture, rows.inside()
         at = picture.find(subset(tracks.link, inside))
         rows = kinship.new_only(rows, picture.updated, at, inside)
-        updated, newest = picture.updated.copy(), np.full(len(picture.id), -1, dtype=np.int64)
+        updated, newest = picture.updated.copy(), filled(len(picture.id), -1, np.int64)
         np.maximum.at(updated, at, subset(tracks.updated, inside))
         np.maximum.at(newest, at, subset(tracks.time, inside))
         seen = np.maximum(picture.seen, newest)
@@ -187,11 +187,14 @@ class FusionCentre(Centre):
             picture, time, support, self.config, self._journal,
             lambda ids: self._suspended.held(rows, self._intake.names(), ids, self._intake),
         )  # fmt: skip
-        self._suspended.take(picture.take(held), self._intake, self._journal)
+        if any_of(held):
+            self._suspended.take(picture.take(held), self._intake, self._journal)
         self._note_waiting()
-        self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
-        tracks.link[among(tracks.link, picture.id[ended])] = NO_TRACK
-        self._picture = picture.take(~ended)
+        if any_of(ended):
+            self._relink(dict.fromkeys(picture.id[ended].tolist(), 0))
+            tracks.link[among(tracks.link, picture.id[ended])] = NO_TRACK
+            picture = picture.take(~ended)
+        self._picture = picture
 
     def _support(
         self, rows: Rows, shared: Shared, inside: NDArray[np.intp], at: NDArray[np.intp], count: int, time: int
@@ -205,14 +208,14 @@ class FusionCentre(Centre):
         spared = self._intake.spared.of(self._intake.names())
         if spared.any():
             expected = np.where(spared[subset(rows.source, inside)], np.maximum(expected, time), expected)
-        due, slowest = np.full(count, -1, dtype=np.int64), np.zeros(count, dtype=np.int64)
+        due, slowest = filled(count, -1, np.int64), np.zeros(count, dtype=np.int64)
         np.maximum.at(due, at, expected)
         np.maximum.at(slowest, at, interval)
         counted = kinship.separate(rows, inside)
         sources = np.bincount(at[(expected >= time) & counted], minlength=count)
         hit = np.bincount(at[subset(rows.fresh, inside)], minlength=count) > 0
         linked = np.bincount(self._picture.find(rows.tracks.link[rows.linked()]), minlength=count)
-        whole = np.full(len(rows.source), -1, dtype=np.int64)
+        whole = filled(len(rows.source), -1, np.int64)
         whole[inside] = expected
         left = shared.support(due, whole, linked == 0)
         unlisted = [links for source in self._intake.sources.values() for links in source.dropped if len(links)]

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints, among, marked, picked, subset
+from fusion_service.arrays import Bools, Floats, Ints, among, filled, finite, marked, picked, subset
 from fusion_service.centre.consensus import Consensus, consensus
 from fusion_service.centre.evidence import Tests
 from fusion_service.centre.journal import Journal
@@ -60,11 +60,14 @@ def manoeuvred(space: tuple[str, ...], acceleration: float, seconds: Floats) -> 
 def _add_manoeuvre(spread: Floats, space: tuple[str, ...], acceleration: float, seconds: Floats) -> None:
     """Add what `manoeuvred` gives to covariances (n, n, M)."""
     gains = (0.5 * seconds**2, seconds, np.ones_like(seconds))
+    more: dict[tuple[int, int], Floats] = {}
     for axis in AXES:
-        there = [(space.index(name), gain) for name, gain in zip(axis, gains, strict=True) if name in space]
+        there = [(space.index(name), order) for order, name in enumerate(axis) if name in space]
         for i, one in there:
             for j, other in there:
-                spread[i, j] += acceleration**2 * one * other
+                if (one, other) not in more:
+                    more[one, other] = acceleration**2 * gains[one] * gains[other]
+                spread[i, j] += more[one, other]
 
 
 def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings, journal: Journal) -> Judgement:
@@ -78,7 +81,7 @@ def judge(rows: Rows, now: Picture, forced: Ints, time: int, settings: Settings,
     outside = np.where(fresh, jumped, subset(tracks.outside, linked))
     some = marked(~outside if rows.out is None else ~outside & ~rows.out[linked])
     agreed = consensus(links[some], subset(tracks.mean, linked[some]), subset(tracks.covariance, linked[some]))
-    distance, shared = np.full(len(linked), np.nan), np.zeros(len(linked), dtype=np.intp)
+    distance, shared = filled(len(linked), np.nan, np.float64), np.zeros(len(linked), dtype=np.intp)
     distance[some], shared[some] = _from_others(rows, linked[some], agreed, tests)
     failed = _worst(links, fresh, distance, predicted, subset(tracks.since, linked), distance > tests.keep[shared])
     outside[failed] = True
@@ -141,7 +144,7 @@ def _from_prediction(rows: Rows, linked: Ints, now: Picture, time: int, settings
 
 def _from_others(rows: Rows, some: Ints, agreed: Consensus, tests: Tests) -> tuple[Floats, Ints]:
     """d2 (S,) of each row to the others of its track, NaN where it is alone, and over how many components."""
-    distance, size = np.full(len(some), np.nan), np.zeros(len(some), dtype=np.intp)
+    distance, size = filled(len(some), np.nan, np.float64), np.zeros(len(some), dtype=np.intp)
     mean, covariance = rows.tracks.mean, rows.tracks.covariance
     for members in agreed.groups:
         if members.shape[1] < 2:
@@ -178,13 +181,13 @@ def _weigh(
 ) -> None:  # fmt: skip
     """Add to the sum of each link with a new datum. What the others say counts once per datum of theirs."""
     tracks, fresh = rows.tracks, subset(rows.fresh, linked)
-    others = np.full(len(linked), -1, dtype=np.int64)
+    others = filled(len(linked), -1, np.int64)
     others[some] = _newest_other(groups, tracks.updated[linked[some]])
     together = np.zeros(len(linked), dtype=np.bool_)
     together[some] = size > 1
     before = subset(tracks.weighed, linked)
     weighed = fresh & together & ~jumped & (others > before)
-    more = np.where(weighed, np.nan_to_num(agreement, nan=0.0), 0.0)
+    more = np.where(weighed, finite(agreement), 0.0)
     more = np.where(fresh & ~together & ~jumped, bound / 4, more)
     more = np.where(jumped, jump, more)
     tracks.evidence[linked] = np.minimum(np.maximum(subset(tracks.evidence, linked) + more, -bound), bound)
@@ -193,7 +196,7 @@ def _weigh(
 
 def _newest_other(groups: list[Ints], updated: NDArray[np.int64]) -> NDArray[np.int64]:
     """For each row the newest datum of the other rows of its track, -1 without any; groups as of `Consensus`."""
-    out = np.full(len(updated), -1, dtype=np.int64)
+    out = filled(len(updated), -1, np.int64)
     for members in groups:
         if members.shape[1] == 2:
             out[members] = updated[members[:, ::-1]]

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints, among, marked
+from fusion_service.arrays import Floats, Ints, among, filled, marked
 from fusion_service.centre.beliefs import OPEN, Beliefs, learned, no_beliefs
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.rows import NO_TRACK, Rows
@@ -271,7 +271,7 @@ def _inherited(beliefs: Beliefs, heirs: Mapping[int, int]) -> Beliefs:
 
 
 def _of_tracks(beliefs: Beliefs, ids: Ids, answers: int) -> tuple[Codes, Floats]:
-    code, p = np.full(len(ids), NONE, dtype=np.int32), np.zeros(len(ids))
+    code, p = filled(len(ids), NONE, np.int32), np.zeros(len(ids))
     if len(beliefs.track) and len(ids):
         best, sure = beliefs.best(answers)
         order = np.lexsort((beliefs.question, -sure, beliefs.track))

@@ -18,6 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import all_of, same_ids
 from fusion_service.config import CentreConfig, SourceConfig
 
 __all__ = [
@@ -88,7 +89,7 @@ def silence_of(interval: int, said: SourceConfig, config: CentreConfig) -> int:
 def intervals(id: NDArray[np.uint64], time: I64, known: Remembered, pace: Pace) -> I64:
     """The interval (T,) of each of the reports of tracks `id` (T,) at `time` (T,), ns; `known`: what they were before.
     An id may be there several times: its newest report has what all of them give."""
-    if (id[1:] > id[:-1]).all():
+    if all_of(id[1:] > id[:-1]):
         interval, before = _before(id, known, pace)
         return next_interval(interval, before, time, pace.floor, pace.cap)
     order = np.lexsort((time, id))
@@ -111,9 +112,9 @@ def intervals(id: NDArray[np.uint64], time: I64, known: Remembered, pace: Pace) 
 
 def _before(ids: NDArray[np.uint64], known: Remembered, pace: Pace) -> tuple[I64, I64]:
     """Interval and time of the last report, -1 without, of tracks `ids`."""
-    interval, before = np.full(len(ids), pace.first, dtype=np.int64), np.full(len(ids), -1, dtype=np.int64)
-    if len(known.id) == len(ids) and (known.id == ids).all():
+    if same_ids(known.id, ids):
         return known.interval, known.time
+    interval, before = np.full(len(ids), pace.first, dtype=np.int64), np.full(len(ids), -1, dtype=np.int64)
     if len(known.id) and len(ids):
         at = np.minimum(np.searchsorted(known.id, ids), len(known.id) - 1)
         was = known.id[at] == ids

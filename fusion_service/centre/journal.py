@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import filled
 from fusion_service.compiled import PLAIN, road
 from fusion_service.config.settings import recordable
 from schemas import Decisions, Entry, StepLog, messages
@@ -123,7 +124,7 @@ class Journal:
 
     def _column(self, kind: int, *columns: NDArray[Any]) -> None:
         # each in its own type from the start: u64 and i64 together would become floats, and ids lose their last bits
-        whole = np.full(len(columns[0]), kind), *columns
+        whole = filled(len(columns[0]), kind, np.uint8), *columns
         self._columns.append(tuple(column.astype(dtype) for column, dtype in zip(whole, _DTYPES, strict=True)))
 
     def birth(self, ids: NDArray[np.uint64]) -> None:
@@ -165,7 +166,10 @@ class Journal:
     def write(self, epoch: int, seq: int, step: int, time: int) -> StepLog:
         """The log of this step; the next one begins empty."""
         parts: list[Any] = list(zip(*self._columns, strict=True)) or [[np.zeros(0)]] * len(_DTYPES)
-        columns = [np.concatenate(part).astype(dtype) for part, dtype in zip(parts, _DTYPES, strict=True)]
+        columns = [
+            part[0].astype(dtype, copy=False) if len(part) == 1 else np.concatenate(part).astype(dtype)
+            for part, dtype in zip(parts, _DTYPES, strict=True)
+        ]
         log = StepLog(
             source=self._name,
             epoch=epoch,

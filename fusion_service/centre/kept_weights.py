@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints, among, from_bytes, marked, to_bytes
+from fusion_service.arrays import Floats, Ints, all_of, among, from_bytes, marked, same_ids, to_bytes
 from fusion_service.records import columns_of
 
 __all__ = ["STEPS", "Ids", "KeptWeights"]
@@ -46,7 +46,7 @@ class _Kept:
 
     def by_id(self) -> _Kept:
         """Sorted."""
-        return self if (self.id[1:] > self.id[:-1]).all() else self.take(np.argsort(self.id, kind="stable"))
+        return self if all_of(self.id[1:] > self.id[:-1]) else self.take(np.argsort(self.id, kind="stable"))
 
     def join(self, *others: _Kept) -> _Kept:
         if not others:
@@ -68,7 +68,7 @@ class KeptWeights:
         if len(sources) < FEWEST or not self._last:
             return None
         kept = self._last.get(len(sources))
-        if kept is not None and _same(kept.id, ids) and bool((kept.source == sources).all()):
+        if kept is not None and _same(kept.id, ids) and all_of(kept.source == sources):
             return kept.weight.copy()
         out = np.full(sources.shape, np.nan)
         for count in sorted(self._last, key=lambda count: (count != len(sources), -count)):
@@ -125,7 +125,7 @@ class KeptWeights:
 
 
 def _same(one: Ids, other: Ids) -> bool:
-    return len(one) == len(other) and bool((one == other).all())
+    return same_ids(one, other)
 
 
 def _brought(known: Ints, weights: Floats, sources: Ints) -> Floats:

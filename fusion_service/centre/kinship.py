@@ -21,7 +21,7 @@ import numpy as np
 from fusion_service.arrays import Bools, Floats, Ints
 from fusion_service.centre.association import by_size
 from fusion_service.centre.intake import Intake
-from fusion_service.centre.lineage import ANYONE, Codes, Kin, overlapping
+from fusion_service.centre.lineage import ANYONE, FEW, Codes, Kin, Lineages, overlapping
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.tracks import Tracks
 from fusion_service.config import CentreConfig
@@ -136,8 +136,15 @@ def inherited(rows: Rows, members: Ints, before: Codes, *, memory: bool) -> Code
     """The lineage (B,) of what groups (B, k) are fused to. before: what it was; memory: that is in the result too."""
     if rows.kin is None:
         return before
-    table = rows.kin.table
-    union, had = table.union(np.ascontiguousarray(rows.kin.code[members].T)), table.masks(before)
+    table, codes = rows.kin.table, rows.kin.code[members]
+    if codes.size > FEW:
+        return _inherited(table, codes, before, memory)
+    key = "inherited", codes.shape, codes.tobytes(), before.tobytes(), memory
+    return table.recalled(key, lambda: _inherited(table, codes, before, memory))
+
+
+def _inherited(table: Lineages, members: Codes, before: Codes, memory: bool) -> Codes:
+    union, had = table.union(np.ascontiguousarray(members.T)), table.masks(before)
     if memory:
         union = union | had
     changed = (union != had).any(axis=0)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import find_sorted
+from fusion_service.arrays import any_of, find_sorted
 from fusion_service.centre.alarms import Twice
 from fusion_service.centre.compartments import Compartments
 from fusion_service.centre.identity import TRUSTED, Identities
@@ -78,13 +78,13 @@ class Labels:
         # an intensity is of all sources, and so are its tracks
         own = self.compartments.origin[at] if self._intake.config.kind == "tracks" else np.zeros(0, dtype=np.uint8)
         called: dict[str, Any] = {}
-        if (identity != NONE).any():
+        if any_of(identity != NONE):
             called |= {"identity": said.identity.said(identity), "identity_p": identity_p}
-        if (kind != NONE).any():
+        if any_of(kind != NONE):
             called |= {"kind": said.kind.said(kind), "kind_p": kind_p}
         return {
             **called,
-            **_if((own != ORIGINS.index(origin)).any(), track_origin=own),
+            **_if(any_of(own != ORIGINS.index(origin)), track_origin=own),
             **_if(marks.any(), marks=marks),
             **_if(number.any(), number=number),
             **_if(any(callsign), callsign=tuple(callsign)),

@@ -172,7 +172,7 @@ def _counted(
     """The window of hits, moved on by as many reports as were due since the last hit, and the step of that."""
     pace = np.maximum(interval, round(config.period * 1e9))
     since = np.where(picture.last_hit >= 0, time - picture.last_hit, pace)
-    shift = np.clip((since + pace // 2) // pace, 1, 63).astype(np.uint64)
+    shift = np.minimum(np.maximum((since + pace // 2) // pace, 1), 63).astype(np.uint64)
     window = np.uint64(2**config.confirm_within - 1)
     hits = np.where(support.hit, ((picture.hits << shift) | np.uint64(1)) & window, picture.hits)
     return hits, np.where(support.hit, time, picture.last_hit)

@@ -8,9 +8,9 @@ a lineage is never told smaller than it is.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from fusion_service.arrays import Bools, Ints
 from schemas import GlobalTracks, LocalTracks
 
-__all__ = ["ALONE", "ANYONE", "NOBODY", "Codes", "Kin", "Lineages", "Masks", "overlapping"]
+__all__ = ["ALONE", "ANYONE", "FEW", "NOBODY", "Codes", "Kin", "Lineages", "Masks", "overlapping"]
 
+Kept = TypeVar("Kept", bound=np.generic)
 Codes = NDArray[np.int32]
 Masks = NDArray[np.uint64]
 """Sets as bits, (W, M): name k is bit k % 64 of word k // 64."""
@@ -31,6 +32,8 @@ _NONE, _NO_BITS = np.zeros(0, dtype=np.int32), np.zeros((0, 0), dtype=np.uint8)
 MOST_NAMES = 4096
 MOST_SETS = 16_384
 ROOM = 1000
+FEW, RECALLED = 512, 64
+"""Codes up to which what they come to is recalled, and how many such answers."""
 MOST_BITS = 2**24
 """Of the sets of one message; beyond, each of its tracks counts as containing all that the message does."""
 
@@ -53,6 +56,7 @@ class Lineages:
         self._sets: list[int] = [0, 1]
         self._codes: dict[int, int] = {0: NOBODY, 1: ANYONE}
         self._table: Masks = np.array([[0, 1]], dtype=np.uint64)
+        self._recalled: dict[tuple[Any, ...], NDArray[Any]] = {}
         self._last: tuple[Any, Codes, tuple[tuple[str, ...], NDArray[np.uint8]]] = None, _NONE, ((), _NO_BITS)
 
     def __len__(self) -> int:
@@ -118,6 +122,22 @@ class Lineages:
     def contain(self, codes: Codes, name: str) -> Bools:
         """Which of the sets (M,) hold `name`, or anyone."""
         bits = [0, self._bits[name]] if name in self._bits else [0]
+        if len(codes) <= FEW:
+            return self.recalled(("contain", codes.tobytes(), *bits), lambda: self._contain(codes, bits))
+        return self._contain(codes, bits)
+
+    def recalled(self, key: tuple[Any, ...], make: Callable[[], NDArray[Kept]]) -> NDArray[Kept]:
+        """What `make` gives, which is the same for a `key` that names the codes that it is of: no code changes what it
+        stands for until `restore`. Not to be written to."""
+        known = self._recalled.get(key)
+        if known is None:
+            if len(self._recalled) >= RECALLED:
+                self._recalled.clear()
+            known = self._recalled[key] = make()
+            known.flags.writeable = False
+        return known
+
+    def _contain(self, codes: Codes, bits: list[int]) -> Bools:
         found = np.zeros(len(codes), dtype=np.bool_)
         masks = self.masks(codes)
         for bit in bits:

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Floats, Ints, picked
+from fusion_service.arrays import Floats, Ints, all_of, picked
 from fusion_service.centre.align import predict_tracks
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.lifecycle import Picture
@@ -85,7 +85,7 @@ class Motions:
         which nothing was heard of them already."""
         age, speed = np.zeros(len(dt)) if age is None else age, self._config.unknown_speed
         space, frame = self._config.space, self._intake.frame
-        kinds = codes[:1] if (codes == codes[:1]).all() else np.unique(codes)
+        kinds = codes[:1] if all_of(codes == codes[:1]) else np.unique(codes)
         if len(kinds) <= 1:
             return predict_tracks(
                 tracks, self.motion(int(kinds[0]) if len(kinds) else -1), space, space, dt, frame, speed, age
@@ -107,6 +107,10 @@ class Motions:
         if self._config.motion is not None:
             return np.full_like(picture.motion, -1)
         codes = np.array([-1 if motion is None else self.code(motion) for motion in declared], dtype=np.int32)
+        if len({*codes.tolist()}) == 1:
+            fed = np.zeros(len(picture.id), dtype=np.bool_)
+            fed[at] = bool(codes[0] >= 0)
+            return self._compacted(np.where(fed, codes[0], picture.motion).astype(np.int32))
         order = sorted(range(len(self.known)), key=self._noise.__getitem__)
         rank = np.full(len(self.known) + 1, -1)
         rank[order] = np.arange(len(order))

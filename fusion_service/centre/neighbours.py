@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, all_of
 from fusion_service.centre.association import CROWDED, candidate_pairs, near_pairs, within
 
 __all__ = ["Neighbours"]
@@ -69,7 +69,7 @@ class Neighbours:
     def pairs(self, ids: Ids, positions: Floats, sigma: Floats, reach: float, source: Ints) -> tuple[Ints, Ints]:
         """As `candidate_pairs` of the rows (d, M), the first of which are the global tracks `ids` (G,), sorted."""
         count = len(sigma)
-        if not (np.isfinite(positions).all() and np.isfinite(sigma).all() and np.isfinite(reach)):
+        if not (all_of(np.isfinite(positions)) and all_of(np.isfinite(sigma)) and np.isfinite(reach)):
             return candidate_pairs(positions, sigma, reach, source)
         if count < CROWDED:
             i, j = _all_pairs(count)

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion_service import linalg
-from fusion_service.arrays import Bools, Floats, Ints
+from fusion_service.arrays import Bools, Floats, Ints, all_of, any_of, filled
 from fusion_service.geodesy import transform
 from fusion_service.motion import predict
 from schemas import UNKNOWN_SIGMA, Frame, Height, Motion
@@ -43,12 +43,13 @@ PLACED = ("still", "ou")
 @dataclass(frozen=True, slots=True, eq=False)
 class Unknown:
     """Of a space of n components: limit (n,), the variance from which each is unknown; pad (n,), its variance where it
-    is; plausible (n,), the variance of what it may be."""
+    is; plausible (n,), the variance of what it may be. limits: the index and the limit of each that may be unknown."""
 
     space: tuple[str, ...]
     limit: Floats
     pad: Floats
     plausible: Floats
+    limits: tuple[tuple[int, float], ...]
 
     @classmethod
     def of(cls, space: tuple[str, ...], speed: float = 100.0, acceleration: float = 20.0) -> Unknown:
@@ -57,10 +58,10 @@ class Unknown:
 
     def known(self, covariance: Floats) -> NDArray[np.bool_]:
         """Which components (n, ...) of densities with `covariance` (n, n, ...) are known."""
-        known = np.ones(covariance.shape[1:], dtype=np.bool_)
-        for k, limit in enumerate(self.limit.tolist()):
-            if limit < np.inf:
-                known[k] = ~(covariance[k, k] >= limit)
+        known = np.empty(covariance.shape[1:], dtype=np.bool_)
+        known.fill(True)
+        for k, limit in self.limits:
+            known[k] = ~(covariance[k, k] >= limit)
         return known
 
     def told(self, covariance: Floats) -> Floats:
@@ -68,7 +69,7 @@ class Unknown:
         readers lose no more digits by it than they must. What has become unknown, by noise, is correlated with nothing
         then: less variance would not bear it."""
         known = self.known(covariance)
-        if known.all():
+        if all_of(known):
             return covariance
         out, diagonal = np.where(known[:, None] & known[None], covariance, 0.0), range(len(covariance))
         out[diagonal, diagonal] = np.where(
@@ -88,9 +89,8 @@ class Unknown:
     def common(self, spread: Floats) -> tuple[Ints, Floats]:
         """Of pairs with the sum of covariances `spread` (n, n, K): how many components both know (K,), and what to add
         (K,) to log det `spread` so that the others count as plausible values."""
-        count, more = np.full(spread.shape[2:], len(spread), dtype=np.intp), np.zeros(spread.shape[2:])
-        diagonal = range(len(spread))
-        if not (spread[diagonal, diagonal] >= self.limit.reshape(-1, *(1,) * (spread.ndim - 2))).any():
+        count, more = filled(spread.shape[2:], len(spread), np.intp), np.zeros(spread.shape[2:])
+        if not any_of(spread.diagonal() >= self.limit):
             return count, more
         for k, (limit, plausible) in enumerate(zip(self.limit, self.plausible, strict=True)):
             missing = spread[k, k] >= limit
@@ -108,7 +108,8 @@ def _unknown(space: tuple[str, ...], speed: float, acceleration: float) -> Unkno
     sigma = np.array([SIGMA[name] for name in space])
     plausible = np.array([likely[name] for name in space])
     limit = np.array([UNKNOWN_SIGMA.get(name, np.inf) for name in space])
-    return Unknown(space, limit**2, sigma**2, plausible**2)
+    finite = tuple((k, one) for k, one in enumerate((limit**2).tolist()) if one < np.inf)
+    return Unknown(space, limit**2, sigma**2, plausible**2, finite)
 
 
 def patterns(known: Bools) -> Iterator[tuple[Ints, Any]]:
@@ -162,7 +163,8 @@ def predict_known(
 
     def moved(names: tuple[str, ...], x: Floats, P: Floats, gone: Floats, since: Floats) -> tuple[Floats, Floats]:
         m, shape = len(names), x.shape
-        one, spread = predict(motion, names, x.reshape(m, -1), P.reshape(m, m, -1), np.tile(gone, shape[1]), frame)
+        gaps = gone if shape[1] == 1 else np.tile(gone, shape[1])
+        one, spread = predict(motion, names, x.reshape(m, -1), P.reshape(m, m, -1), gaps, frame)
         spread = spread.reshape(m, *shape)
         for place, velocity in AXES:
             if velocity in unknown.space and place in names and velocity not in names and motion.kind not in PLACED:
@@ -170,7 +172,7 @@ def predict_known(
                 spread[k, k] += speed**2 * gone * (gone + 2.0 * since)
         return brought(one.reshape(shape), spread, names, unknown)
 
-    if known.all():
+    if all_of(known):
         return moved(space, mean, covariance, dt, ages)
     out_mean = np.empty((len(unknown.space), *mean.shape[1:]))
     out_covariance = np.empty((len(unknown.space), *out_mean.shape))

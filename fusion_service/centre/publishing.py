@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion_service.arrays import all_of
 from fusion_service.centre.extent_fusion import extent_columns
 from fusion_service.centre.intake import Intake
 from fusion_service.centre.journal import Journal
@@ -120,7 +121,7 @@ def _published(picture: Picture, contributions: Contributions, intake: Intake) -
     if config.publish_region is not None and intake.frame is not None:
         places = [config.space.index(axis) for axis in ("x", "y", "z") if axis in config.space]
         shown &= region_holds(config.publish_region, picture.mean[places])
-    if shown.all():
+    if all_of(shown):
         return picture, contributions
     whose = np.repeat(shown, contributions.counts)
     kept = Contributions(

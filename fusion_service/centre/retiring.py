@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from fusion_service.arrays import Ints, marked
+from fusion_service.arrays import Ints, any_of, marked
 from fusion_service.centre import notes
 from fusion_service.centre.intervals import Remembered, remember, silence
 from fusion_service.centre.sources import Source
@@ -24,7 +24,7 @@ def retire(source: Source, said: SourceConfig, time: int, room: int, config: Cen
     limit = silence(table.interval, said, config)
     source.why = "" if source.why == notes.waiting() else source.why
     late = age > limit
-    retired = late.any()
+    retired = any_of(late)
     if retired:
         source.tracks = table.take(~late)
     oldest = time - round(config.remember * 1e9)

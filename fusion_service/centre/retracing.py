@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from fusion_service.centre.centre import Centre, StepResult
+from fusion_service.centre.centre import Centre
 from fusion_service.centre.era import NewEra
 from fusion_service.centre.events import Event, Refused, Skipped, SourceFound, SourceLost
 from fusion_service.centre.inputs import Input
+from fusion_service.centre.result import StepResult
 from fusion_service.order import order_of
 from schemas import StepLog
 

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion_service.arrays import Bools, Floats, Ints, marked
+from fusion_service.arrays import Bools, Floats, Ints, all_of, marked, same_ids
 from fusion_service.centre.words import Codes
 from fusion_service.densities import Mixtures
 from fusion_service.records import altered, columns_of, made
@@ -255,7 +255,7 @@ def taken(columns: Any, rows: Any) -> Any:
         return made(type(columns), [column[..., rows] for column in columns_of(columns)])
     if rows.dtype != np.bool_:
         return made(type(columns), [column.take(rows, axis=-1) for column in columns_of(columns)])
-    if rows.all():
+    if all_of(rows):
         return columns
     at = marked(rows)
     return made(type(columns), [column.take(at, axis=-1, mode="clip") for column in columns_of(columns)])
@@ -264,7 +264,7 @@ def taken(columns: Any, rows: Any) -> Any:
 def by_id(tracks: Tracks) -> Tracks:
     """The same, sorted by id; those of one id in the order of time, or as given where times are equal."""
     ids = tracks.id
-    if (ids[1:] > ids[:-1]).all():
+    if all_of(ids[1:] > ids[:-1]):
         return tracks
     return tracks.take(np.lexsort((tracks.time, ids)))
 
@@ -283,7 +283,7 @@ def renewed(old: Tracks, new: Tracks, versions: bool = False) -> Step:
     """The step from a table, sorted by id, to what a report says, `new` (as `by_id`; it may hold an id several times):
     of each id the newest counts, the later given where times are equal. Links are kept unless the origin has changed.
     versions: give the pairs too."""
-    if len(old.id) == len(new.id) > 0 and (old.id == new.id).all() and (old.time <= new.time).all():
+    if len(new.id) and same_ids(old.id, new.id) and all_of(old.time <= new.time):
         return _renewed_all(old, new, versions)
     last = np.append(new.id[1:] != new.id[:-1], np.ones(min(len(new.id), 1), dtype=np.bool_))
     pair = successive(old, new) if versions and not last.all() else None
@@ -316,7 +316,7 @@ def _renewed_all(old: Tracks, new: Tracks, versions: bool) -> Step:
         later = same & (new.updated > old.updated)
         pair = (old.take(later), new.take(later)) if later.any() else None
     kept = {name: getattr(old, name) for name in LINKS}
-    if not same.all():
+    if not all_of(same):
         kept = {name: np.where(same, column, getattr(new, name)) for name, column in kept.items()}
     return Step(_alike(old, altered(new, **kept)), np.zeros(len(old.id), dtype=np.bool_), pair)
 

@@ -10,7 +10,6 @@ it has published, from data that are a second old at most. The centre is told fo
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 import time
 from collections import Counter
@@ -34,6 +33,7 @@ from fusion_service.centre import (
     source_of,
 )
 from fusion_service.config import CentreConfig
+from fusion_service.records import altered
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
@@ -224,7 +224,7 @@ class LastingCentre:
         result = self.centre.step(at)
         checkpoint = self.centre.checkpoint() if _settles(result, self._config.kind) else None
         sent = time.time_ns()
-        tracks, journal = (dataclasses.replace(part, sent=sent) for part in (result.tracks, result.log))
+        tracks, journal = altered(result.tracks, sent=sent), altered(result.log, sent=sent)
         payloads = {"tracks": encode(tracks, sound=True), "log": encode(journal, sound=True)}
         self._changed = self._fresh = True
         self._newest = max(self._newest, int(result.picture.ids.max(initial=0)))
@@ -312,6 +312,7 @@ class LastingCentre:
             result = centre.step(at)
             encode(result.tracks)
             encode(result.log)
+            result.settle()
             centre.checkpoint()
         except Exception:
             return True
