@@ -3,12 +3,18 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# With it, each of the hundreds of processes of the tests would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test slow-test lint format docs wheel-test python-test bench studies clean
 .DELETE_ON_ERROR:
 
 demo: $(VENV)/ready
 	$(BIN)/fusion-service demo $(ARGS)
+
+# Tests are processes beside each other: each computes in one thread.
+test slow-test: export OMP_NUM_THREADS := 1
+test slow-test: export OPENBLAS_NUM_THREADS := 1
 
 test: lint
 	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(ARGS)

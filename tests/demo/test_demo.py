@@ -226,6 +226,7 @@ def test_each_robot_is_two_clients(tmp_path: Path) -> None:
     centre_config(plan.settings(1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("FUSION_DATA" not in os.environ, reason="set FUSION_DATA to the folder of the Autoferry recordings")
 def test_autoferry_from_start_to_score(tmp_path: Path) -> None:
     out, scores = tmp_path / "out", tmp_path / "scores.json"

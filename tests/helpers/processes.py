@@ -29,12 +29,13 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{server.getsockname()[1]}"
 
 
-def eventually(condition: Callable[[], object], timeout: float = 20.0) -> float:
-    """Wait until `condition()` holds; the seconds it took. Fails after `timeout`."""
+def eventually(condition: Callable[[], object], timeout: float = 20.0, every: float = 0.005) -> float:
+    """Wait until `condition()` holds; the seconds it took. Fails after `timeout`. What reads a recording to know is
+    asked less often: `every`, s."""
     begin = time.monotonic()
     while not condition():
         assert time.monotonic() - begin < timeout, f"did not happen within {timeout} s"
-        time.sleep(0.005)
+        time.sleep(every)
     return time.monotonic() - begin
 
 
