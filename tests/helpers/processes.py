@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable
 from typing import Self
 
+from tests.helpers.nursery import Forked, begin
+
 HUB = """
 import sys, threading
 from fusion_service.bus.hub import run_hub
@@ -40,12 +42,15 @@ def eventually(condition: Callable[[], object], timeout: float = 20.0, every: fl
 
 
 class Program:
-    """A Python program in a process of its own, killed at the end of the `with` block at the latest."""
+    """A Python program in a process of its own, killed at the end of the `with` block at the latest. `fresh`: it begins
+    with an interpreter that has loaded nothing, as users' programs do."""
 
-    def __init__(self, code: str, *arguments: str) -> None:
+    def __init__(self, code: str, *arguments: str, fresh: bool = False) -> None:
         command = [sys.executable, "-W", "error", "-c", code, *arguments]
         pipe = subprocess.PIPE
-        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
+        self._process: subprocess.Popen[bytes] | Forked = (None if fresh else begin(code, arguments)) or (
+            subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
+        )
         assert self._process.stderr is not None
         fcntl.fcntl(self._process.stderr, fcntl.F_SETPIPE_SZ, ROOM)
         self._lines = b""
