@@ -12,16 +12,16 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: $(VENV)/ready
 	$(BIN)/fusion-service demo $(ARGS)
 
-# Tests are processes beside each other: each computes in one thread.
+# Tests are processes beside each other: each computes in one thread. One more than cores: some wait for a bus.
 test slow-test: export OMP_NUM_THREADS := 1
 test slow-test: export OPENBLAS_NUM_THREADS := 1
 
 test: lint
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal $(ARGS)
 
 # The tests that take tens of seconds each, which `make test` leaves out.
 slow-test: $(VENV)/ready
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow $(ARGS)
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m slow $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check -q .

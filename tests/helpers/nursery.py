@@ -122,8 +122,8 @@ def begin(code: str, arguments: tuple[str, ...]) -> Forked | None:
             for number in theirs:
                 os.close(number)
         assert len(answer) == 8, "the nursery has ended"
-    ours = [os.fdopen(ends[0][1], "wb"), os.fdopen(ends[1][0], "rb"), os.fdopen(ends[2][0], "rb")]
-    return Forked(int.from_bytes(answer, "big"), *ours)
+    stdin, stdout, stderr = open(ends[0][1], "wb"), open(ends[1][0], "rb"), open(ends[2][0], "rb")  # noqa: SIM115
+    return Forked(int.from_bytes(answer, "big"), stdin, stdout, stderr)
 
 
 def _opened() -> socket.socket:
@@ -134,7 +134,12 @@ def _opened() -> socket.socket:
         process = subprocess.Popen(
             command, cwd=ROOT, env=one_thread, pass_fds=[theirs.fileno()], stdin=subprocess.DEVNULL
         )
-        atexit.register(lambda: (ours.close(), process.wait()))  # it ends when nobody can ask any more
+
+        def ended() -> None:
+            ours.close()
+            process.wait()  # it ends when nobody can ask any more
+
+        atexit.register(ended)
         theirs.close()
         _NURSERY.append(ours)
     return _NURSERY[0]
@@ -181,5 +186,6 @@ def _entered(told: dict[str, Any], pipes: list[int], others: tuple[int, int]) ->
     os.environ.update(told["environment"])
     os.chdir(told["folder"])
     sys.argv = ["-c", *told["arguments"]]
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # though the tests run in the background
     names: dict[str, Any] = sys.modules["__main__"].__dict__
     return compile(told["code"], "<string>", "exec"), names

@@ -114,7 +114,7 @@ class Program:
     def end(self, timeout: float = 10.0) -> tuple[int, str]:
         """Wait for it to end by itself: (exit code, what it wrote to stderr)."""
         _, errors = self._process.communicate(timeout=timeout)
-        return self._process.returncode, errors.decode()
+        return self._process.wait(), errors.decode()
 
 
 class Hub:
