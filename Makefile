@@ -3,6 +3,8 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# With it, each of the hundreds of processes of the tests would compile all modules again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test slow-test lint format docs wheel-test python-test bench studies clean
 .DELETE_ON_ERROR:
@@ -10,12 +12,16 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 demo: $(VENV)/ready
 	$(BIN)/fusion-service demo $(ARGS)
 
+# Tests are processes beside each other: each computes in one thread. One more than cores: some wait for a bus.
+test slow-test: export OMP_NUM_THREADS := 1
+test slow-test: export OPENBLAS_NUM_THREADS := 1
+
 test: lint
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal $(ARGS)
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal $(ARGS)
 
 # The tests that take tens of seconds each, which `make test` leaves out.
 slow-test: $(VENV)/ready
-	$(BIN)/python -m pytest -q -n 2 --dist worksteal -m slow $(ARGS)
+	$(BIN)/python -m pytest -q -n 3 --dist worksteal -m slow $(ARGS)
 
 lint: $(VENV)/ready
 	$(BIN)/ruff check -q .

@@ -38,7 +38,12 @@ def chosen() -> dict[str, str]:
     """{version: command} of the lowest and the highest Python here, but not of that which runs all tests."""
     found = {f"3.{minor}": f"python3.{minor}" for minor in KNOWN if version_of(f"python3.{minor}") == f"3.{minor}"}
     ends = {version: found[version] for version in (*list(found)[:1], *list(found)[-1:])}
-    return {version: command for version, command in ends.items() if version != version_of(".venv/bin/python")}
+    return {version: command for version, command in ends.items() if version != own()}
+
+
+def own() -> str | None:
+    """The version that runs all tests: that of .venv, or, while there is none yet, this one, which is to make it."""
+    return version_of(".venv/bin/python") or version_of(sys.executable)
 
 
 def tested(version: str, python: str) -> str:
@@ -88,7 +93,7 @@ def main(given: list[str]) -> None:
         told.append(f"{version} {tested(version, python) if version_of(python) else 'skipped'}")
         print(f"Python {told[-1]}", flush=True)
     if not pythons:
-        print(f"no Python but {version_of('.venv/bin/python') or version_of(sys.executable)} is here: skipped")
+        print(f"no Python but {own()} is here: skipped")
 
 
 if __name__ == "__main__":

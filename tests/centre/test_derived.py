@@ -129,9 +129,10 @@ def test_messages_that_are_not_heard_make_it_less_than_exact() -> None:
     for time, heard in steps(filters, 120):
         rows = filters.rows()
         now = derived.follow(rows, NAMES, heard, noise(), np.ones(len(rows.source), dtype=np.bool_), time)
-        if time > 60 * 10**9:
+        if time > 60 * 10**9 and time // 10**9 % 3 == 0:
             found.append([excess(filters, rule, now).max() for rule in ("bar-shalom-campo", "bci")])
     optimal, honest = np.array(found).T
+    assert len(optimal) == 20
     assert 1.02 < optimal.max() < 1.2
     assert optimal.mean() < 1.06
     assert honest.max() < 1.03
@@ -244,7 +245,6 @@ def test_a_centre_fuses_by_it_and_goes_on_after_a_restart(rule: str, options: di
     checkpoint."""
     config = {"rule": rule, "rule_options": options, "space": SPACE, "frame": FRAME, "lateness": 1.0}
     whole, turned = (FusionCentre(config) for _ in range(2))
-    restored: FusionCentre | None = None
     filters = Filters(SIGMAS, periods=(1.0, 1.1, 2.3), offsets=(0.13, 0.9, 1.7))  # no two updates between two steps
     for one in (whole, turned):
         for name in NAMES:
@@ -253,19 +253,20 @@ def test_a_centre_fuses_by_it_and_goes_on_after_a_restart(rule: str, options: di
                 position=(0.0, 0.0, 0.0),
             )  # fmt: skip
             one.handle(info, START)
+    restarted, compared = 20, 35  # s; the other goes no further: by 60 s the start is forgotten
     for time, _ in steps(filters, 60):
         sent = messages(filters, time // 10**9)
         results = []
-        for one in (whole, turned, *([restored] if restored else [])):
+        for one in (whole, *([turned] if time <= compared * 10**9 else [])):
             for message in sent if one is whole else sent[::-1]:
                 one.handle(message, START + time)
             results.append(one.step(START + time).tracks)
         for other in results[1:]:
             for name in ("ids", "means", "covariances", "contributor_influence"):
                 np.testing.assert_array_equal(getattr(other, name), getattr(results[0], name))
-        if time == 20 * 10**9:
-            restored = FusionCentre(config, turned.checkpoint())
-    assert restored is not None
+        assert (len(results) == 2) is (time <= compared * 10**9)
+        if time == restarted * 10**9:
+            turned = FusionCentre(config, turned.checkpoint())
     published = results[0]
     true = filters.J
     H = np.tile(np.eye(4), (3, 1))

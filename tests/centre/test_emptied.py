@@ -139,13 +139,17 @@ class Behind:
 
 @pytest.fixture
 def compiled(request: pytest.FixtureRequest) -> Iterator[str]:
+    if request.param == "on":
+        pytest.importorskip("numba")
     before = road()
     yield use(request.param)
     use("off" if before == "plain" else "on")
 
 
 @pytest.mark.parametrize(
-    ("memory", "compiled"), [("restart", "off"), ("recursive", "off"), ("restart", "auto")], indirect=["compiled"]
+    ("memory", "compiled"),
+    [("restart", "off"), ("recursive", "off"), pytest.param("restart", "on", marks=pytest.mark.slow)],
+    indirect=["compiled"],
 )
 def test_a_centre_that_is_behind_loses_and_doubles_no_target(memory: str, compiled: str) -> None:
     assert compiled

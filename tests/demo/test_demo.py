@@ -54,7 +54,7 @@ def test_three_radars_from_start_to_score(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     arguments = ("--speed", "30", "--live", "--out", str(out), "--json", str(scores))
-    with Program(COMMAND, "demo", *arguments) as program:
+    with Program(COMMAND, "demo", *arguments, fresh=True) as program:
         assert program.line(60).startswith("three-radars: 300 s")
         line = program.line(60)
         assert line.startswith("look on: rerun --connect rerun+http://127.0.0.1:")
@@ -92,7 +92,7 @@ def test_three_radars_from_start_to_score(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_ctrl_c_in_the_middle_ends_everything_and_the_recording_opens(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with Program(COMMAND, "demo", "--speed", "10", "--out", str(out)) as program:
+    with Program(COMMAND, "demo", "--speed", "10", "--out", str(out), fresh=True) as program:
         eventually(lambda: (out / "radar3.log").exists(), 30)
         eventually(lambda: (out / "mission.rrd").stat().st_size > 100_000, 30)
         begin = time.monotonic()
@@ -226,11 +226,12 @@ def test_each_robot_is_two_clients(tmp_path: Path) -> None:
     centre_config(plan.settings(1.0))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif("FUSION_DATA" not in os.environ, reason="set FUSION_DATA to the folder of the Autoferry recordings")
 def test_autoferry_from_start_to_score(tmp_path: Path) -> None:
     out, scores = tmp_path / "out", tmp_path / "scores.json"
     arguments = ("--scenario", "autoferry:2", "--speed", "30", "--out", str(out), "--json", str(scores))
-    with Program(COMMAND, "demo", *arguments) as program:
+    with Program(COMMAND, "demo", *arguments, fresh=True) as program:
         code, errors = program.end(timeout=90.0)
     assert code == 0, errors
     result = json.loads(scores.read_text())

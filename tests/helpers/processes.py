@@ -13,6 +13,8 @@ import time
 from collections.abc import Callable
 from typing import Self
 
+from tests.helpers.nursery import Forked, begin
+
 HUB = """
 import sys, threading
 from fusion_service.bus.hub import run_hub
@@ -29,22 +31,26 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{server.getsockname()[1]}"
 
 
-def eventually(condition: Callable[[], object], timeout: float = 20.0) -> float:
-    """Wait until `condition()` holds; the seconds it took. Fails after `timeout`."""
+def eventually(condition: Callable[[], object], timeout: float = 20.0, every: float = 0.005) -> float:
+    """Wait until `condition()` holds; the seconds it took. Fails after `timeout`. What reads a recording to know is
+    asked less often: `every`, s."""
     begin = time.monotonic()
     while not condition():
         assert time.monotonic() - begin < timeout, f"did not happen within {timeout} s"
-        time.sleep(0.005)
+        time.sleep(every)
     return time.monotonic() - begin
 
 
 class Program:
-    """A Python program in a process of its own, killed at the end of the `with` block at the latest."""
+    """A Python program in a process of its own, killed at the end of the `with` block at the latest. `fresh`: it begins
+    with an interpreter that has loaded nothing, as users' programs do."""
 
-    def __init__(self, code: str, *arguments: str) -> None:
+    def __init__(self, code: str, *arguments: str, fresh: bool = False) -> None:
         command = [sys.executable, "-W", "error", "-c", code, *arguments]
         pipe = subprocess.PIPE
-        self._process = subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
+        self._process: subprocess.Popen[bytes] | Forked = (None if fresh else begin(code, arguments)) or (
+            subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=pipe)
+        )
         assert self._process.stderr is not None
         fcntl.fcntl(self._process.stderr, fcntl.F_SETPIPE_SZ, ROOM)
         self._lines = b""
@@ -108,7 +114,7 @@ class Program:
     def end(self, timeout: float = 10.0) -> tuple[int, str]:
         """Wait for it to end by itself: (exit code, what it wrote to stderr)."""
         _, errors = self._process.communicate(timeout=timeout)
-        return self._process.returncode, errors.decode()
+        return self._process.wait(), errors.decode()
 
 
 class Hub:

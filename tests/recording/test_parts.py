@@ -381,7 +381,7 @@ def test_the_process_loses_nothing_when_it_rotates_under_load_and_is_killed(hub:
         eventually(lambda: folder.is_dir() and parts(folder), 20)
         load.tell()
         assert load.line(30) == "done"
-        eventually(lambda: sum(1 for _ in read(folder)) == len(said), 20)
+        eventually(lambda: sum(1 for _ in read(folder)) == len(said), 20, every=0.5)
         recorder.signal(signal.SIGKILL)
         recorder.kill()
     found = list(read(folder))

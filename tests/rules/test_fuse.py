@@ -69,7 +69,7 @@ def test_any_shape(rule: str, options: dict[str, Any], shape: tuple[int, ...], N
 @pytest.mark.parametrize(("N", "n"), [(2, 1), (2, 4), (2, 8), (3, 4)])
 def test_bits_do_not_depend_on_the_batch(rule: str, options: dict[str, Any], N: int, n: int) -> None:
     """One element of some is hard enough for the slow road, one is not definite."""
-    size = 260 if (N, n) == (2, 4) else 40
+    size = 260 if (N, n) == (2, 4) else 24
     rng = np.random.default_rng(SEED)
     x, P = batch(rng, size, N, n, decades=3.0)
     if n > 1:
@@ -87,7 +87,7 @@ def test_bits_do_not_depend_on_the_batch(rule: str, options: dict[str, Any], N: 
         whole = fuse_last(rule, xs, Ps, given, influence=True, **rest)
     assert np.isnan(whole.covariance[:, :, 5]).all()
     assert np.isfinite(np.delete(whole.covariance, 5, axis=2)).all()
-    for part in (slice(0, 1), slice(4, 8), slice(7, 8), slice(11, 31), slice(size - 3, size)):
+    for part in (slice(0, 1), slice(4, 8), slice(7, 8), slice(11, 21), slice(size - 3, size)):
         w = None if given is None else given[:, part]
         alone = fuse_last(rule, xs[..., part].copy(), Ps[..., part].copy(), w, influence=True, **rest)
         for name in ("mean", "covariance", "weights", "influence"):

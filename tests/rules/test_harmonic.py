@@ -119,10 +119,11 @@ def test_weights_of_many_sources_solve_77(criterion: str, constants: bool) -> No
         A = np.linalg.inv(P)
         fused = fuse("hmd-ga", x, P, criterion=criterion, constants=constants)
 
-        def best_inverse(z: Floats) -> float:
+        C = np.stack([np.linalg.inv(A.sum(axis=0) - a) for a in A])
+        c = np.stack([C[j] @ sum(A[i] @ x[i] for i in range(N) if i != j) for j in range(N)])
+
+        def best_inverse(z: Floats, C: Floats = C, c: Floats = c) -> float:
             v = np.exp(z) / np.exp(z).sum()
-            C = [np.linalg.inv(A.sum(axis=0) - a) for a in A]  # noqa: B023
-            c = np.stack([C[j] @ sum(A[i] @ x[i] for i in range(N) if i != j) for j in range(N)])  # noqa: B023
             r = c - v @ c
             return cost(criterion, np.einsum("i,ijk->jk", v, C) + (r.T * v) @ r)
 

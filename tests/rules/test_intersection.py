@@ -47,7 +47,7 @@ def lowest(f: Callable[[Floats], float], N: int) -> float:
 
 
 @pytest.mark.parametrize("N", [2, 3, 5])
-@pytest.mark.parametrize("n", [1, 2, 4, 7])
+@pytest.mark.parametrize("n", [1, 2, 7])
 @pytest.mark.parametrize("criterion", CRITERIA)
 @pytest.mark.parametrize("rho", [1.0, 0.6, 0.01])
 def test_weights_are_the_best(N: int, n: int, criterion: str, rho: float) -> None:

@@ -126,11 +126,12 @@ def test_list_names_every_parameter_with_its_source(capsys: pytest.CaptureFixtur
     assert "mrclam:N" in out
 
 
-def test_help_has_examples() -> None:
+def test_help_has_examples(capsys: pytest.CaptureFixture[str]) -> None:
     for command in ([], ["simulate"], ["playback"], ["list"]):
-        run = subprocess.run([sys.executable, "-c", MAIN, *command, "--help"], capture_output=True, text=True)
-        assert run.returncode == 0
-        assert "examples:\n  sensor-client" in run.stdout
+        with pytest.raises(SystemExit) as ended:
+            main([*command, "--help"])
+        assert ended.value.code == 0
+        assert "examples:\n  sensor-client" in capsys.readouterr().out
 
 
 class Listener:

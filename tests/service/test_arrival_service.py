@@ -57,4 +57,4 @@ def test_scans_are_stepped_as_they_come_and_a_reader_has_the_whole_picture(scene
     assert picture.ids.tolist() == newest.ids.tolist()
     waits = [one.sent - one.time for one in deltas]
     print("ms from the time of a scan to its picture:", np.percentile(waits, (50, 100)) / 1e6)
-    assert np.median(waits) < 0.15e9, "much less than the sources' and the centre's period"
+    assert np.median(waits) < 0.4e9, "stepped by the centre's period of 1 s it would be 0.6 s"

@@ -19,9 +19,9 @@ DATA = data_folder("autoferry")
 LONG = {
     *("autoferry", "dubey-consensus", "li-nonlinear", "sharma-three-radars", "tracklets", "unequal-sensors"),
     *("dubey-sonobuoys-ct", "dubey-sonobuoys-cv", "sharma-network-1", "sharma-network-2", "track-correlation"),
-    *("uney-bernoulli", "uney-iid-cluster"),
+    *("uney-bernoulli", "uney-iid-cluster", "li-linear", "li-phd-filter", "correlation-sweep"),
 }
-"""Ten seconds and more each, for they fly whole missions: `make slow-test`."""
+"""Three seconds and more each, for they fly whole missions or sweep: `make slow-test`."""
 
 
 @pytest.mark.parametrize(

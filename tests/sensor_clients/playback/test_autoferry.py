@@ -173,7 +173,7 @@ def gospa(tracks: Floats, truth: Floats, c: float = 20.0) -> float:
 
 
 @pytest.mark.skipif("FUSION_DATA" not in os.environ, reason="needs the Autoferry files: set FUSION_DATA")
-@pytest.mark.parametrize("number", [2, 3, 5, 13, 16])
+@pytest.mark.parametrize("number", [2, *(pytest.param(one, marks=pytest.mark.slow) for one in (3, 5, 13)), 16])
 def test_real_scenes_score_better_than_no_tracks_at_all(number: int) -> None:
     """Two missed vessels cost 20 m; each sensor alone stays below that on every scene."""
     scenario = autoferry.load(data_folder("autoferry") or Path(), number)

@@ -299,20 +299,21 @@ def test_what_cannot_be_read_is_said_with_its_line(data: Path, tmp_path: Path) -
 
 
 @pytest.mark.skipif("FUSION_DATA" not in os.environ, reason="set FUSION_DATA to the folder that holds mrclam")
-def test_on_the_data() -> None:
+@pytest.mark.parametrize("robots", [(1, 4), pytest.param((1, 2, 3, 4, 5), marks=pytest.mark.slow)], ids=len)
+def test_on_the_data(robots: tuple[int, ...]) -> None:
     folder = data_folder("mrclam")
     if folder is None or not (folder / "6" / "landmarks.csv").is_file():
         pytest.skip("no mrclam/6 in FUSION_DATA")
     scenario = mrclam.load(folder, 6)
     truth = {event.time: event.fields for event in scenario.truth()}
     scores = []
-    for n in range(1, 6):
+    for n in robots:
         for event in scenario.sensors[f"robot{n}-self"](0):
             if event.kind == "tracks" and event.time in truth:
                 fields = truth[event.time]
                 error = event.fields["means"][0, :2] - fields["means"][fields["ids"].tolist().index(n)]
                 scores.append([error @ error, float(nees(error, event.fields["covariances"][0, :2, :2])) / 2])
     squared, normalised = np.mean(scores, axis=0)
-    assert len(scores) > 3500
+    assert len(scores) > 700 * len(robots)
     assert math.sqrt(squared) < 0.25
     assert 0.7 < normalised < 1.3
