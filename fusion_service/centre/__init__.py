@@ -12,6 +12,7 @@ from fusion_service.centre.judging import Outcome, View, judge
 from fusion_service.centre.making import make_centre
 from fusion_service.centre.naming import LocalKey
 from fusion_service.centre.pictures import is_picture_of, source_of
+from fusion_service.centre.whereabouts import Whereabouts
 from fusion_service.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
 
 __all__ = [
@@ -38,6 +39,7 @@ __all__ = [
     "StepResult",
     "View",
     "WallClock",
+    "Whereabouts",
     "glance",
     "is_picture_of",
     "judge",

@@ -107,6 +107,11 @@ class State:
         self._last, self.epoch_above = max(self._last, generation), max(self.epoch_above, epoch)
 
     @property
+    def inherits(self) -> bool:
+        """Whether the service that begins goes on where another one was."""
+        return self._inherits
+
+    @property
     def trouble(self) -> str:
         """See the class."""
         return self._unsaved or self._unwritten

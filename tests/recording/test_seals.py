@@ -530,7 +530,7 @@ def test_a_killed_recorder(hub: Hub, keys: Path, ca: Ca, authority: Authority, t
             for n in range(50):
                 publisher.put(said(n)[1])
             eventually(lambda k=k: count(folder) >= 50 * (k + 1), 20)  # type: ignore[misc]
-            # A kill between a message's flush and its seal leaves it unsealed for good: that is a case of its own above.
+            # A kill between a flush and its seal leaves a message unsealed for good: a case of its own above.
             eventually(lambda k=k: verify(folder).whole >= 50 * (k + 1), 20)  # type: ignore[misc]
             if k == 0:
                 recorder.signal(signal.SIGKILL)
