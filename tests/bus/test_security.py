@@ -276,6 +276,6 @@ def test_idle_connections_hold_up_nobody(keys: Path) -> None:
             begin = time.monotonic()
             party = None if security is None else read_security(keys / "source-one")
             with open_bus([endpoint], wait=10.0, security=party):
-                assert time.monotonic() - begin < 4.0
+                assert time.monotonic() - begin < 8.0, "ten where they do"
             for one in idle:
                 one.close()

@@ -77,7 +77,7 @@ class Program:
     def running(self) -> bool:
         return self._process.poll() is None
 
-    def line(self, timeout: float = 10.0) -> str:
+    def line(self, timeout: float = 20.0) -> str:
         """The next line that it prints."""
         pipe = self._process.stdout
         assert pipe is not None
@@ -105,7 +105,7 @@ class Program:
         assert self._process.stderr is not None
         return self._process.stderr.read().decode()
 
-    def end(self, timeout: float = 10.0) -> tuple[int, str]:
+    def end(self, timeout: float = 20.0) -> tuple[int, str]:
         """Wait for it to end by itself: (exit code, what it wrote to stderr)."""
         _, errors = self._process.communicate(timeout=timeout)
         return self._process.returncode, errors.decode()

@@ -210,7 +210,7 @@ def test_a_recorder_that_is_killed_or_stopped_leaves_all_it_wrote(
         stopped = time.monotonic()
         program.signal(end)
         program.end()
-        assert time.monotonic() - stopped < 2.0
+        assert time.monotonic() - stopped < 10.0
     found = list(read(path))
     assert sorted((raw.key, raw.data) for raw in found) == sorted(said)
     assert [raw.arrival for raw in found] == list(range(len(said)))

@@ -51,7 +51,8 @@ def test_what_is_asked_for_comes() -> None:
 @pytest.mark.parametrize("way", ["deaf", "lost"])
 def test_a_question_or_answer_that_is_lost_costs_no_more_than_asking_again(first: int, way: str) -> None:
     """The one to make it, before the other can be asked at all, and each of the parts."""
-    other = Other(**{way: range(first, first + 2)})
+    some = range(first, first + 2)
+    other = Other(deaf=some) if way == "deaf" else Other(lost=some)
     assert copied(other.ask, other.over, lambda: other.now) == Loaded(BLOB, 9, other.made)
     assert other.now < 2 * AGAIN
 
