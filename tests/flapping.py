@@ -34,7 +34,7 @@ class Sides:
         stack.callback(self.link.close)
         stack.enter_context(open_bus([self.link.endpoint], [there], mode="router"))
         self._one, self._two, self._looks = (
-            stack.enter_context(open_bus([end], wait=10.0)) for end in (here, there, there)
+            stack.enter_context(open_bus([end], wait=60.0)) for end in (here, there, there)
         )
         self._got: list[bytes] = []
         self._two.subscribe("t/data", lambda key, data: self._got.append(data), history=0)

@@ -28,7 +28,7 @@ def late_recorder(lab: Lab) -> bool:
     """Who joins later gets the last info of a radar that says nothing any more, and hears of its token."""
     heard: list[str] = []
     tokens: list[str] = []
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("recorder-rec")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("recorder-rec")) as bus:
         bus.subscribe(f"{V1}/**", lambda key, data: heard.append(key))
         bus.watch(f"{V1}/*/*/alive", lambda key, up: tokens.append(key))
         alive = {f"{V1}/local/r1/alive", f"{V1}/global/main/alive"}
@@ -38,7 +38,7 @@ def late_recorder(lab: Lab) -> bool:
 def viewer(lab: Lab) -> bool:
     """A viewer hears the picture, and asks for it."""
     heard: list[bytes] = []
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("viewer-wall")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("viewer-wall")) as bus:
         bus.subscribe(f"{V1}/global/*/tracks", lambda key, data: heard.append(data), history=0)
         asked = bus.ask(f"{V1}/global/main/picture") + bus.ask(f"{V1}/global/*/picture")
         pictures = [schemas.decode(data) for _, data in asked]
@@ -50,8 +50,8 @@ def recorder_seen(lab: Lab) -> bool:
     """A viewer sees that a recorder is there, and asks what it keeps."""
     tokens: list[str] = []
     with (
-        open_bus([lab.endpoint], wait=10.0, security=lab.security("recorder-rec")) as recorder,
-        open_bus([lab.endpoint], wait=10.0, security=lab.security("viewer-wall")) as bus,
+        open_bus([lab.endpoint], wait=60.0, security=lab.security("recorder-rec")) as recorder,
+        open_bus([lab.endpoint], wait=60.0, security=lab.security("viewer-wall")) as bus,
     ):
         recorder.announce(f"{V1}/record/rec/alive")
         recorder.answer(f"{V1}/record/rec/state", lambda _: b"kept")
@@ -75,9 +75,9 @@ def operator(lab: Lab) -> bool:
         lab.endpoint,
         *security,
     ]
-    done = subprocess.run([*command, "quarantine", "--source", "r1"], capture_output=True, text=True, timeout=20)
+    done = subprocess.run([*command, "quarantine", "--source", "r1"], capture_output=True, text=True, timeout=120)
     key = schemas.order_key("main", "alice")
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("operator-alice")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("operator-alice")) as bus:
 
         def stands() -> bool:
             (answer,) = bus.ask(key, msgpack.packb({"what": "list"}))
@@ -90,7 +90,7 @@ def operator(lab: Lab) -> bool:
 def gateway(lab: Lab) -> bool:
     """A gateway publishes as a source, and reads the picture."""
     heard: list[bytes] = []
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("gateway-gate")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("gateway-gate")) as bus:
         bus.subscribe(f"{V1}/global/main/tracks", lambda key, data: heard.append(data))
         publisher = bus.publisher(f"{V1}/local/gate/tracks")
 

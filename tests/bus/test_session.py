@@ -33,7 +33,7 @@ with open_bus([sys.argv[1]]) as bus:
 
 @pytest.fixture
 def sessions(hub: Hub) -> Iterator[tuple[Bus, Bus]]:
-    with open_bus([hub.endpoint], wait=10) as one, open_bus([hub.endpoint], wait=10) as other:
+    with open_bus([hub.endpoint], wait=60.0) as one, open_bus([hub.endpoint], wait=60.0) as other:
         yield one, other
 
 
@@ -275,7 +275,7 @@ def test_an_answer_that_does_not_come_in_time(sessions: tuple[Bus, Bus]) -> None
 def test_what_is_put_before_closing_still_arrives(hub: Hub, sessions: tuple[Bus, Bus]) -> None:
     got: list[int] = []
     sessions[0].subscribe("t/a", lambda key, data: got.append(int(data)))
-    with open_bus([hub.endpoint], wait=10) as leaving:
+    with open_bus([hub.endpoint], wait=60.0) as leaving:
         publisher = leaving.publisher("t/a", cache=500)
         for i in range(500):
             publisher.put(number(i))
@@ -346,7 +346,7 @@ class TestJoining:
         with pytest.raises(BusError), open_bus([free_endpoint()], wait=False):
             pass
         assert time.monotonic() - begin < 10
-        with open_bus([hub.endpoint], wait=10):
+        with open_bus([hub.endpoint], wait=60.0):
             pass
         with open_bus([hub.endpoint], wait=False) as bus:
             assert bus.connected
@@ -411,7 +411,7 @@ except KeyboardInterrupt:
 
 class TestHub:
     def test_an_endpoint_in_use_is_one_line(self, hub: Hub) -> None:
-        with open_bus([hub.endpoint], wait=10):
+        with open_bus([hub.endpoint], wait=60.0):
             pass
         with pytest.raises(BusError, match="in use") as caught:
             run_hub([hub.endpoint], threading.Event())
@@ -424,7 +424,7 @@ class TestHub:
             stop = threading.Event()
             thread = threading.Thread(target=run_hub, args=([endpoint], stop))
             thread.start()
-            with open_bus([endpoint], wait=5) as bus:
+            with open_bus([endpoint], wait=60.0) as bus:
                 assert bus.connected
             stop.set()
             thread.join(5)
@@ -435,8 +435,8 @@ class TestHub:
         got: list[bytes] = []
         with (
             open_bus(listen=[endpoint], mode="router") as router,
-            open_bus([endpoint], wait=5) as one,
-            open_bus([endpoint], wait=5) as other,
+            open_bus([endpoint], wait=60.0) as one,
+            open_bus([endpoint], wait=60.0) as other,
         ):
             router.subscribe("t/a", lambda key, data: got.append(data))
             other.subscribe("t/b", lambda key, data: got.append(data))
@@ -481,7 +481,7 @@ def test_a_process_ends_by_itself_however_it_leaves(hub: Hub, last: str, code: i
 
 def test_an_exception_in_the_block_passes_through(hub: Hub) -> None:
     def fail() -> None:
-        with open_bus([hub.endpoint], wait=10) as bus:
+        with open_bus([hub.endpoint], wait=60.0) as bus:
             bus.subscribe("t/**", lambda key, data: None)
             raise ZeroDivisionError
 

@@ -41,7 +41,7 @@ class Watch:
         self.logs: list[StepLog] = []
         self.alive: list[bool] = []
         self._wholes = schemas.Wholes()
-        self.bus = stack.enter_context(open_bus([endpoint], wait=10.0))
+        self.bus = stack.enter_context(open_bus([endpoint], wait=60.0))
         self.bus.watch(schemas.global_key("*", "alive"), lambda key, alive: self.alive.append(alive))
         for what in ("tracks", "log", "status"):
             self.bus.subscribe(schemas.global_key("*", what), self._take)

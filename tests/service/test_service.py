@@ -217,7 +217,7 @@ def test_a_step_that_fails_does_not_end_the_service(
     path = scene.folder / "centre.toml"
     path.write_text(CONFIG.format(centre="", endpoint=scene.endpoint, state=scene.folder / "state"))
     stop = threading.Event()
-    with open_state(str(scene.folder / "state")) as state, open_bus([scene.endpoint], wait=10.0) as bus:
+    with open_state(str(scene.folder / "state")) as state, open_bus([scene.endpoint], wait=60.0) as bus:
         service = Service(load_config(path), bus, state)
         service._lasting.centre.restored = True  # type: ignore[attr-defined]
         thread = threading.Thread(target=service.run, args=(stop,))
@@ -251,7 +251,7 @@ def test_ctrl_c_ends_everything_at_once(tmp_path: Path) -> None:
         programs = [stack.enter_context(Program(COMMAND, *command)) for command in commands]
         sensor = stack.enter_context(Program(SENSOR, endpoint, "r1", "given", "0"))
         assert sensor.line() == "up"
-        bus = stack.enter_context(open_bus([endpoint], wait=10.0))
+        bus = stack.enter_context(open_bus([endpoint], wait=60.0))
         seen = Observer(bus)
         eventually(lambda: recording.exists() and seen.sees(0)(), 20)
         for program in reversed(programs):
