@@ -64,8 +64,8 @@ class Promised:
             given.append(one)
             taken |= set() if one is None else {one}
         if begun is not None and None in given:
-            for group, track in self._nearby(begun, np.flatnonzero([one is None for one in given])).items():
-                given[group] = track
+            for index, track in self._nearby(begun, np.flatnonzero([one is None for one in given])).items():
+                given[index] = track
                 taken.add(track)
         self._ids = {local: track for local, track in self._ids.items() if track not in taken}
         return given

@@ -69,6 +69,7 @@ class Succession(NamedTuple):
     generation: int
     epoch: int
     orders: Sequence[Order]
+    born: bytes
 
 
 class Sample(NamedTuple):
@@ -363,9 +364,9 @@ class Standby:
         return sum(name < self._name for name in self._nodes)
 
     def _succession(self, why: str) -> Succession:
-        checkpoint, ended, orders = self._shadow.heritage()
+        checkpoint, ended, orders, born = self._shadow.heritage()
         if self._shadow.wanted and checkpoint is not None:
             log.warning("takes over from step %d of the other: %s", self._shadow.mark[1], self._shadow.wanted)
         with self._lock:
             terms = [*self._holding, self._following, self._generation]
-        return Succession(why, checkpoint, ended, max(terms), max(self._epoch, self._shadow.newest[0]), orders)
+        return Succession(why, checkpoint, ended, max(terms), max(self._epoch, self._shadow.newest[0]), orders, born)

@@ -38,7 +38,7 @@ from fusion_service.service.held import synced
 from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
-from fusion_service.service.young import Born, born_in, noted
+from fusion_service.service.young import Born, born_in, noted, padded
 from schemas import Message, StepLog, encode, messages
 
 __all__ = ["SAVED_EVERY", "LastingCentre", "Made"]
@@ -128,7 +128,7 @@ class LastingCentre:
         if self._checkpoint is not None:
             ended, born = (
                 np.concatenate(self._ended),
-                born_in(b"".join(one.ljust(-(-len(one) // 8) * 8, b"\0") for one in self._born)),
+                born_in(b"".join(map(padded, self._born))),
             )
             self._checkpoint = without(self._config, self._checkpoint, ended, born)
         self._ended, self._born = [NONE], [b""]

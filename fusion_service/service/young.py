@@ -17,7 +17,7 @@ import numpy as np
 from fusion_service.centre import LocalKey, Whereabouts
 from schemas import GlobalTracks
 
-__all__ = ["Born", "born_in", "noted"]
+__all__ = ["Born", "born_in", "noted", "padded", "places_of"]
 
 END = b"\x01"
 WORD = 8
@@ -49,6 +49,22 @@ def noted(picture: GlobalTracks, above: int, where: Callable[[int], Whereabouts]
     parts = columns[0], which.astype("<u2"), columns[2], columns[3]
     body = cast(bytes, msgpack.packb([names, *(part.tobytes() for part in parts), where(above).packed()]))
     return len(body).to_bytes(4, "little") + body + END
+
+
+def padded(note: bytes) -> bytes:
+    """A note as it stands before another one."""
+    return note.ljust(-(-len(note) // WORD) * WORD, b"\0")
+
+
+def places_of(picture: GlobalTracks, above: int) -> Whereabouts:
+    """Where the tracks of a picture are, as it says, whose ids are above `above`; of mixtures it is not known."""
+    n = len(picture.space)
+    if picture.counts is not None:
+        return Whereabouts.nothing(n)
+    at = picture.ids > np.uint64(above)
+    mean, covariance = np.moveaxis(picture.means[at], 0, -1), np.moveaxis(picture.covariances[at], 0, -1)
+    time = np.full(int(at.sum()), picture.time, dtype=np.int64)
+    return Whereabouts(repr(picture.frame), picture.ids[at], time, mean, covariance)
 
 
 def born_in(notes: bytes) -> Born:
