@@ -15,8 +15,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
+from fusion_service.centre import FusionCentre
 from fusion_service.config import CentreConfig
-from fusion_service.service import files
+from fusion_service.service import files, state
 from fusion_service.service.bounded import BoundedLog
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State
@@ -25,7 +26,7 @@ from schemas import GlobalTracks
 from schemas.messages import CONFIRMED
 from tests.centre.worlds import SECOND, START, info, tracks
 
-PERIOD = 0.2
+PERIOD, ROOM = 0.2, 512
 SOURCES = ("r1", "r2")
 # In each step: what each source tells, targets k at (1000 k, 0) with their local ids.
 Told = dict[str, dict[int, int]]
@@ -100,9 +101,9 @@ class Points:
         self.now = 100.0
         self._folder = folder
         patch.setattr("fusion_service.service.stepping.time.monotonic", lambda: self.now)
-        patch.setattr(files.os, "fsync", lambda handle: None)
+        patch.setattr(os, "fsync", lambda handle: None)
         for name in ("replace", "unlink", "ftruncate"):
-            patch.setattr(files.os, name, self._around(getattr(os, name)))
+            patch.setattr(os, name, self._around(getattr(os, name)))
         patch.setattr(files, "_write", self._torn(files._write))
 
     def keep(self) -> None:
@@ -160,6 +161,8 @@ def test_ids_go_on_wherever_between_two_writes_a_kill_comes(
         period=PERIOD, lateness=2.0, coast=3.0, rule="ci",
         confirm_hits=confirms, confirm_within=max(4, confirms), confirm_sources=3,
     )  # fmt: skip
+    monkeypatch.setattr(state, "ROOM_BORN", ROOM)
+    monkeypatch.setattr(state, "ROOM_ENDED", ROOM)
     folder, seqs = tmp_path / "state", Counter[str]()
     folder.mkdir(mode=0o700)
     points = Points(folder, monkeypatch)
@@ -179,7 +182,9 @@ def test_ids_go_on_wherever_between_two_writes_a_kill_comes(
     assert sum((one.status == CONFIRMED).sum() for one in points.pictures) >= (10 if confirms == 3 else 0)
     found, again = points.found, tmp_path / "again"
     monkeypatch.undo()
-    monkeypatch.setattr(files.os, "fsync", lambda handle: None)
+    monkeypatch.setattr(os, "fsync", lambda handle: None)
+    monkeypatch.setattr(state, "ROOM_BORN", ROOM)
+    monkeypatch.setattr(state, "ROOM_ENDED", ROOM)
     wrong: list[str] = []
     for number, point in enumerate(found):
         for first in (("r1",), ("r2",), SOURCES):
@@ -193,3 +198,18 @@ def test_ids_go_on_wherever_between_two_writes_a_kill_comes(
     print(len(found), "points")
     assert len(found) > 40
     assert not wrong, "\n".join(wrong)
+
+
+def test_an_id_that_the_checkpoint_has_is_promised_to_nobody() -> None:
+    """As where a kill comes after the checkpoint was replaced, and before the notes were cleared."""
+    centre = FusionCentre(CentreConfig(period=PERIOD))
+    centre.handle(info("r1", period=PERIOD), START)
+    centre.handle(tracks("r1", 0.0, [[0.0, 0.0, 0.0, 0.0]], [1]), START)
+    [known] = centre.step(START).picture.ids.tolist()
+    centre.promise([(("r1", 1, 7), known), (("r1", 1, 8), known + 50)])
+    places = [[0.0, 0.0, 0.0, 0.0], [7000.0, 0.0, 0.0, 0.0], [8000.0, 0.0, 0.0, 0.0]]
+    centre.handle(tracks("r1", PERIOD, places, [1, 7, 8], seq=1), START)
+    shown = targets(centre.step(START + round(PERIOD * SECOND)).picture)
+    assert shown[0] == known
+    assert shown[8] == known + 50
+    assert len(set(shown.values())) == 3
