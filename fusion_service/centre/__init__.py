@@ -13,6 +13,7 @@ from fusion_service.centre.making import make_centre
 from fusion_service.centre.naming import LocalKey
 from fusion_service.centre.pictures import is_picture_of, source_of
 from fusion_service.centre.result import StepResult
+from fusion_service.centre.whereabouts import Whereabouts
 from fusion_service.order import NEEDED, WHAT, LocalId, Order, order_of, read_order
 
 __all__ = [
@@ -39,6 +40,7 @@ __all__ = [
     "StepResult",
     "View",
     "WallClock",
+    "Whereabouts",
     "glance",
     "is_picture_of",
     "judge",

@@ -40,6 +40,7 @@ from fusion_service.centre.result import StepResult
 from fusion_service.centre.revising import Revision
 from fusion_service.centre.rows import Rows
 from fusion_service.centre.status import step_status
+from fusion_service.centre.whereabouts import Whereabouts
 from fusion_service.config import CentreConfig, centre_config, config_hash
 from fusion_service.order import Order
 from schemas import Status, StepLog, messages
@@ -110,7 +111,7 @@ class Centre(ABC):
         if era is not None:
             self._begin_era(era, received)
         if isinstance(event, Skipped):
-            self._journal.event({"kind": "skipped", "steps": event.steps})
+            self._journal.event({"kind": "skipped", "steps": event.steps} | ({"absent": True} if event.absent else {}))
             self._history.behind()
         if not isinstance(event, (ClockSet, NewEra)):
             self._intake.put(event, received)
@@ -294,11 +295,16 @@ class Centre(ABC):
         self._state = None
         return int(gone.sum()) + self._stop_waiting(tracks)
 
-    def promise(self, born: Iterable[tuple[LocalKey, int]]) -> None:
+    def promise(self, born: Iterable[tuple[LocalKey, int]], where: Iterable[Whereabouts] = ()) -> None:
         """Ids that were published for these local tracks since the checkpoint that this centre was made from: tracks
-        that they begin take them."""
-        self._ids.promised.add(born)
+        that they begin, or that begin where they were last, take them. Of ids that it has already nothing is new."""
+        there = {*self._picture.id.tolist(), *self._ids.waiting.tolist()}
+        self._ids.promised.add([one for one in born if one[1] not in there], where)
         self._state = None
+
+    def young(self, above: int) -> Whereabouts:
+        """Where the tracks are whose ids are above `above`."""
+        return Whereabouts.of(self._picture, above, self._intake.frame)
 
     def checkpoint(self) -> bytes:
         """The whole state but what is queued, as versioned MessagePack: a centre made from it goes on as this one."""

@@ -38,9 +38,11 @@ class Refused:
 
 @dataclass(frozen=True, slots=True)
 class Skipped:
-    """So many steps before the next one are not made, since the service is behind: told in the log."""
+    """So many steps before the next one are not made, since the service is behind: told in the log. absent: since none
+    was there, so that nobody knows what came meanwhile."""
 
     steps: int
+    absent: bool = False
 
 
 Event: TypeAlias = Message | SourceFound | SourceLost | Order | Refused | Skipped | ClockSet | NewEra

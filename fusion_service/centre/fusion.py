@@ -25,6 +25,7 @@ from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.supervision import Supervisor
 from fusion_service.centre.suspended import Suspended
 from fusion_service.centre.tracks import relinked
+from fusion_service.centre.whereabouts import Whereabouts
 from fusion_service.config import CentreConfig
 from fusion_service.records import altered
 
@@ -97,6 +98,8 @@ class FusionCentre(Centre):
         self._picture = self._suspended.resume(
             rows, names, self._picture, self._intake, self._step, time, self._linker.tests, self._journal
         )
+        if self._ids.promised:
+            self._ids.promised.look = lambda where: self._looked(where, names, time)
         now = self._associate(rows, names, time)
         self._supervisor.observe(rows, names, now, self._step, time, self._journal, self._own())
         shared = self._blobs.follow(rows, names, now, time, self._intake.frame)
@@ -107,6 +110,11 @@ class FusionCentre(Centre):
         self._supervisor.conduct.judge_existence(rows, self._picture, self._entries, time, self._journal)
         write_back(rows, self._intake)
         return self._contributions(rows, influence)
+
+    def _looked(self, where: Whereabouts, names: tuple[str, ...], time: int) -> Whereabouts | None:
+        """Where promised tracks are at `time`, ns, as the sources say that targets move; None where it is not known."""
+        declared = [self._intake.motion_said(self._intake.sources[name]) for name in names]
+        return where.now(time, self._intake.frame, self._memory.motions, declared)
 
     def _own(self) -> dict[str, tuple[float, float]]:
         """What is known of the sources' own innovations, by name: mean normalised square, and freedom."""
@@ -220,7 +228,8 @@ class FusionCentre(Centre):
         left = shared.support(due, whole, linked == 0)
         unlisted = [links for source in self._intake.sources.values() for links in source.dropped if len(links)]
         dropped = left & among(self._picture.id, np.concatenate([NOTHING, *unlisted]))
-        return Support(sources, hit, due, slowest, left, dropped, self._last)
+        before = self._last + self._intake.spared.gap  # while the centre was not there no time went by
+        return Support(sources, hit, due, slowest, left, dropped, before)
 
     def _contributions(self, rows: Rows, influence: NDArray[np.float64]) -> Contributions:
         picture, tracks, inside = self._picture, rows.tracks, rows.inside()

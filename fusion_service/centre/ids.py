@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fusion_service.centre.naming import Book, LocalKey, Places
 from fusion_service.centre.promised import Promised
+from fusion_service.centre.whereabouts import Begun
 
 __all__ = ["Ids"]
 
@@ -29,15 +30,20 @@ class Ids:
         self.next = (generation << 32) + 1
 
     def allot(
-        self, count: int, whom: Callable[[], Sequence[Sequence[LocalKey]] | Places] | None = None
+        self,
+        count: int,
+        whom: Callable[[], Sequence[Sequence[LocalKey]] | Places] | None = None,
+        begun: Callable[[], Begun] | None = None,
     ) -> NDArray[np.uint64]:
         """So many ids, new ones in order, but for tracks that begin again: in a step made again, or after a restart.
-        whom: the groups of local tracks that they are for, or the places."""
+        whom: the groups of local tracks that they are for, or the places; begun: what these groups begin with."""
         if whom is None or not count or (self.book is None and not self.promised):
             first, self.next = self.next, self.next + count
             return np.arange(first, self.next, dtype=np.uint64)
         groups = whom()
-        known = [None] * count if isinstance(groups, Places) or not self.promised else self.promised.take(groups)
+        known: list[int | None] = [None] * count
+        if self.promised and not isinstance(groups, Places):
+            known = self.promised.take(groups, begun() if begun is not None else None)
         if self.book is not None:
             return np.array(self.book.allot(groups, self.fresh, known), dtype=np.uint64)
         new = iter(self.fresh(known.count(None)))

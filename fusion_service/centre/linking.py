@@ -32,6 +32,7 @@ from fusion_service.centre.meeting import Meeting
 from fusion_service.centre.neighbours import Neighbours
 from fusion_service.centre.rows import NO_TRACK, Rows
 from fusion_service.centre.tracks import set_links
+from fusion_service.centre.whereabouts import founders
 from fusion_service.config import CentreConfig
 from fusion_service.metrics import assign_near
 from fusion_service.records import altered
@@ -254,7 +255,11 @@ class Linker:
         if len(chosen) > room:
             journal.refuse(Entry("", 0, 0, 0, "too-many-tracks", len(chosen) - room))
             chosen = chosen[:room]
-        new = self._ids.allot(len(chosen), lambda: locals_of(rows, journal.sources, free, groups, chosen))
+        new = self._ids.allot(
+            len(chosen),
+            lambda: locals_of(rows, journal.sources, free, groups, chosen),
+            lambda: founders(rows, free, groups, chosen, self.tests.unknown),
+        )
         given = np.zeros(count, dtype=np.uint64)
         given[chosen] = new
         takes = given[groups] != NO_TRACK

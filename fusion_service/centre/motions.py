@@ -101,6 +101,11 @@ class Motions:
         """The motion of a code."""
         return self._config.motion or (self.known[code] if code >= 0 else USUAL)
 
+    def wildest(self, declared: Iterable[Motion | None]) -> int:
+        """The code of the motion with the most noise among these."""
+        codes = [-1 if motion is None else self.code(motion) for motion in declared]
+        return max(codes, key=lambda code: self._noise[code] if code >= 0 else (0.0, ""), default=-1)
+
     def follow(self, picture: Picture, at: Ints, declared: Iterable[Motion | None], source: Ints) -> Codes:
         """The codes (G,) after a step: tracks that rows feed move as these declare; at (R,) rows of the picture that
         rows of `source` (R,), index into `declared`, feed."""

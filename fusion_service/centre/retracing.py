@@ -23,7 +23,7 @@ def events_of(log: StepLog) -> list[Event]:
         if kind in ("found", "lost") and isinstance(source, str):
             events.append((SourceFound if kind == "found" else SourceLost)(source))
         elif kind == "skipped" and isinstance(event.get("steps"), int):
-            events.append(Skipped(event["steps"]))
+            events.append(Skipped(event["steps"], event.get("absent") is True))
         elif kind == "era" and isinstance(event.get("time"), int):
             events.append(NewEra(event["time"]))
         elif (order := order_of(event)) is not None:

@@ -14,7 +14,8 @@ from fusion_service.config import CentreConfig
 __all__ = ["GRACE", "Spared"]
 
 DEAF = 2.0
-"""Seconds of steps not made from which the centre was not there; less is a hiccup."""
+"""Seconds of steps not made from which the centre was not there; less is a hiccup, unless it was made anew."""
+NEVER = 2**62
 HELD = 60.0
 """Seconds up to which tracks are held over such a time; what was there before a longer one is no picture of now."""
 GRACE = 10_000_000_000
@@ -34,7 +35,7 @@ class Spared:
         self._span = round((config.delay + 2 * config.period) * 1e9)
         self._until: dict[str, int] = {}
         self.newest: set[str] = set()
-        self._deaf = round(DEAF / config.period) if config.suspend else 2**62
+        self._deaf = round(DEAF / config.period) if config.suspend else NEVER
         self._slept = 0
         self.awake = -1
         self.gap = 0
@@ -42,7 +43,10 @@ class Spared:
 
     def sleep(self, event: object) -> None:
         """Steps before the next one are not made."""
-        self._slept += event.steps if isinstance(event, Skipped) else 0
+        if isinstance(event, Skipped):
+            self._slept += event.steps
+            if event.absent and self._deaf < NEVER:
+                self._slept = max(self._slept, self._deaf)
 
     def slept_as(self, other: Spared) -> None:
         """So much was told for the next step as `other` was told."""

@@ -4,7 +4,8 @@ A step log names what the step took; the messages came here too, so the same ste
 compared with the picture that the active centre published. Where a message is missing, a step failed or gave other
 tracks, or the settings differ, nothing more is made: `wanted` says why a new checkpoint is needed. Until it is there,
 this process would go on from the last step that it made, or, where that came out wrong, from the last checkpoint,
-without the tracks that have ended since, as a service does that was killed, and with the orders given since. Where the
+without the tracks that have ended since, as a service does that was killed, with the ids of those that have begun, for
+their local tracks, and with the orders given since. Where the
 same tracks have other numbers, it goes on, and takes a new checkpoint when it may: a checkpoint does not tell what came
 before it, so that data that were late for steps before it change the active centre's alone.
 """
@@ -22,6 +23,7 @@ from fusion_service.centre.inputs import Input, InputBuffer
 from fusion_service.centre.retracing import events_of, step_again
 from fusion_service.config import CentreConfig
 from fusion_service.service.heard import HeardOrders
+from fusion_service.service.young import noted, padded, places_of
 from schemas import GlobalTracks, LocalIntensity, LocalTracks, MessageError, SensorInfo, StepLog, digest
 
 __all__ = ["PATIENCE", "Heritage", "Mark", "Shadow", "same_numbers", "same_tracks"]
@@ -48,11 +50,13 @@ class Kept(NamedTuple):
 
 
 class Heritage(NamedTuple):
-    """What to go on from: a checkpoint, None where there is none, and since then tracks that have ended, and orders."""
+    """What to go on from: a checkpoint, None where there is none, and since then tracks that have ended, orders, and
+    notes of tracks that have begun (see `young`)."""
 
     checkpoint: bytes | None
     ended: NDArray[np.uint64]
     orders: list[Order]
+    born: bytes
 
 
 class Shadow:
@@ -71,6 +75,9 @@ class Shadow:
         self._pictures: dict[Mark, GlobalTracks] = {}
         self._made: dict[Mark, GlobalTracks] = {}
         self._ended: dict[Mark, NDArray[np.uint64]] = {}
+        self._born: dict[Mark, bytes] = {}
+        self._above = 0
+        """The newest id that the kept checkpoint has."""
         self.mark: Mark = (-1, -1)
         self.newest: Mark = (-1, -1)
         """The newest step that a log or picture was heard of."""
@@ -99,17 +106,26 @@ class Shadow:
         centre, fault = make_centre(self._config, blob, epoch=mark[0])
         if fault:
             return fault
-        self._centre, self._kept, self.mark, self.wanted = centre, Kept(blob, mark, centre.orders.next), mark, ""
+        self._centre, self.mark, self.wanted = centre, mark, ""
         self.fetched, self.loaded, self._off, self._astray = self.fetched + 1, self._now(), False, False
-        self.orders.settle(mark[0], centre.orders.next)
+        self._keep(centre, blob)
         self._made.clear()
         for _, (log, _) in sorted(self._logs.items()):
             if (log.epoch, log.step) <= mark:
                 self._buffer.settle(log, self._config.lateness)
-        for held in (self._logs, self._pictures, self._ended):
+        for held in (self._logs, self._pictures):
             for old in [one for one in held if one <= mark]:
                 del held[old]
         return ""
+
+    def _keep(self, centre: Centre, blob: bytes) -> None:
+        """This checkpoint, of the step at `mark`, is what is gone on from where a later one came out wrong."""
+        self._kept = Kept(blob, self.mark, centre.orders.next)
+        self._above = int(centre.view().ids.max(initial=0))
+        self.orders.settle(self.mark[0], centre.orders.next)
+        for held in (self._ended, self._born):
+            for old in [one for one in held if one <= self.mark]:
+                del held[old]
 
     def local(self, message: object, key: str, data: bytes, received: int) -> None:
         """A message of a source, or the picture of another centre that is one."""
@@ -128,6 +144,8 @@ class Shadow:
         self.newest = max(self.newest, mark)
         if isinstance(message, StepLog):
             self.orders.tell(message.epoch, message.events)
+        else:
+            self._note(mark, message)
         if mark <= self.mark:
             if isinstance(message, GlobalTracks):
                 self._check(mark, message)
@@ -136,10 +154,20 @@ class Shadow:
             self._logs[mark] = message, self._now()
         else:
             self._pictures[mark] = message
-            self._ended[mark] = np.array([one for one, _, _ in message.ended], dtype=np.uint64)
-        for held in (self._logs, self._pictures, self._ended):
+        for held in (self._logs, self._pictures):
             while len(held) > MOST:
                 del held[min(held)]
+
+    def _note(self, mark: Mark, published: GlobalTracks) -> None:
+        """What a picture says has ended and begun since the kept checkpoint."""
+        if self._kept is not None and mark <= self._kept.mark:
+            return
+        if published.ended:
+            self._ended[mark] = np.array([one for one, _, _ in published.ended], dtype=np.uint64)
+        if note := noted(published, self._above, lambda above: places_of(published, above)):
+            self._born[mark] = note
+        while len(self._born) > MOST:
+            del self._born[min(self._born)]
 
     @property
     def waits(self) -> bool:
@@ -186,9 +214,8 @@ class Shadow:
             del self._made[min(self._made)]
         if (published := self._pictures.pop(mark, None)) is not None:
             self._check(mark, published)
-        if self.orders.full and not self._astray:
-            self._kept = Kept(self._centre.checkpoint(), mark, self._centre.orders.next)
-            self.orders.settle(mark[0], self._centre.orders.next)
+        if not self._astray and (self.orders.full or len(self._ended) + len(self._born) > MOST):
+            self._keep(self._centre, self._centre.checkpoint())
 
     def _stray(self, why: str) -> None:
         """What was made here is not the active centre's state."""
@@ -210,9 +237,11 @@ class Shadow:
         elif self._kept is not None:
             blob, mark, following = self._kept
         else:
-            return Heritage(None, np.zeros(0, dtype=np.uint64), self.orders.since(0))
-        gone = [ids for one, ids in self._ended.items() if one > mark]
-        return Heritage(blob, np.concatenate([np.zeros(0, dtype=np.uint64), *gone]), self.orders.since(following))
+            return Heritage(None, np.zeros(0, dtype=np.uint64), self.orders.since(0), b"")
+        gone = [ids for one, ids in sorted(self._ended.items()) if one > mark]
+        born = b"".join(padded(note) for one, note in sorted(self._born.items()) if one > mark)
+        ended = np.concatenate([np.zeros(0, dtype=np.uint64), *gone])
+        return Heritage(blob, ended, self.orders.since(following), born)
 
     def left(self, since: int) -> list[tuple[str, Input]]:
         """What came since then, ns, and was in no step yet, each with its source, in the order of arrival."""

@@ -28,6 +28,7 @@ from fusion_service.bus import Bus, BusError, Inbox
 from fusion_service.centre import Order, is_picture_of
 from fusion_service.config import ServiceConfig
 from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.copying import Loaded, copied, pause
 from fusion_service.service.deafness import Deafness
 from fusion_service.service.notify import notify
 from fusion_service.service.shadow import PATIENCE, Shadow
@@ -50,10 +51,6 @@ COPIED = 2.0
 ROUND = 0.02
 AWAKE, MOST_AWAKE = 0.7, 0.25
 """Of the time without a sign, in which this process must have been awake; seconds that one round counts at most."""
-SPACING, SHARE = 0.25, 10.0
-"""Seconds between two checkpoints that are asked for, and so many times what the last one took."""
-FETCH = 5.0
-"""Seconds for one to come."""
 HUNG = 5.0
 """Seconds, and periods, without a round of the active one's loop after which it is as good as gone."""
 KEPT = 10.0
@@ -72,20 +69,13 @@ class Succession(NamedTuple):
     generation: int
     epoch: int
     orders: Sequence[Order]
+    born: bytes
 
 
 class Sample(NamedTuple):
     key: str
     data: bytes
     received: int
-
-
-class Loaded(NamedTuple):
-    """A checkpoint that was fetched."""
-
-    blob: bytes
-    epoch: int
-    step: int
 
 
 class Told(NamedTuple):
@@ -216,8 +206,8 @@ class Standby:
             if self._yielded and self._shadow.wanted:
                 self._fetch(stop, last=True)
             elif self._shadow.lacks and self._holding and begin > self._fetched:
-                self._fetch(stop)
-                self._fetched = seconds() + max(SPACING, SHARE * (seconds() - begin))
+                came = self._fetch(stop)
+                self._fetched = seconds() + pause(seconds() - begin, came)
             self._hurry.wait(max(0.0, begin + self._takeover / 4 - seconds()))
             self._hurry.clear()
 
@@ -256,27 +246,13 @@ class Standby:
         if isinstance(held := answer.get("orders"), list) and isinstance(epoch, int):
             self._inbox.put("", Told(epoch, [one for one in held if isinstance(one, dict)]))
 
-    def _fetch(self, stop: threading.Event, last: bool = False) -> None:
-        """A checkpoint of the active process, part by part, into the inbox. last: the one that it has made by itself,
+    def _fetch(self, stop: threading.Event, last: bool = False) -> bool:
+        """A checkpoint of the active process into the inbox; whether it came. last: the one that it has made by itself,
         since it hands over."""
-        deadline = seconds() + FETCH
-        if not last:
-            self._ask_once({"what": "state"})
-        parts: dict[int, bytes] = {}
-        of: object = None
-        count = 1
-        while len(parts) < count and not stop.is_set() and not self._over.is_set() and seconds() < deadline:
-            answer = self._ask_once({"what": "state", "part": len(parts)})
-            data, more = answer.get("data"), answer.get("parts")
-            if not isinstance(data, bytes) or type(more) is not int or answer.get("part") != len(parts):
-                self._over.wait(0.02)
-                continue
-            if of not in (None, answer.get("of")):
-                return
-            of, count = answer.get("of"), more
-            parts[len(parts)] = data
-        if len(parts) == count and isinstance(of, list) and len(of) == 2 and all(type(one) is int for one in of):
-            self._inbox.put("", Loaded(b"".join(parts.values()), *of))
+        copy = copied(self._ask_once, lambda wait: self._over.wait(wait) or stop.is_set(), seconds, last)
+        if copy is not None:
+            self._inbox.put("", copy)
+        return copy is not None
 
     # The loop
 
@@ -388,9 +364,9 @@ class Standby:
         return sum(name < self._name for name in self._nodes)
 
     def _succession(self, why: str) -> Succession:
-        checkpoint, ended, orders = self._shadow.heritage()
+        checkpoint, ended, orders, born = self._shadow.heritage()
         if self._shadow.wanted and checkpoint is not None:
             log.warning("takes over from step %d of the other: %s", self._shadow.mark[1], self._shadow.wanted)
         with self._lock:
             terms = [*self._holding, self._following, self._generation]
-        return Succession(why, checkpoint, ended, max(terms), max(self._epoch, self._shadow.newest[0]), orders)
+        return Succession(why, checkpoint, ended, max(terms), max(self._epoch, self._shadow.newest[0]), orders, born)

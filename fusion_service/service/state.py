@@ -70,6 +70,7 @@ class State:
         self._unsaved = ""
         self._heritage: tuple[bytes | None, NDArray[np.uint64]] | None = None
         self._inherits = False
+        self._inherited = b""
         self.node = self._kept_node() or 0
         """This process' own among those that give ids under one centre's name (see `terms`)."""
         self.epoch_above = 0
@@ -99,14 +100,20 @@ class State:
         generation: int,
         epoch: int,
         orders: Sequence[Order] = (),
+        born: bytes = b"",
     ) -> None:
         """A service begins next that goes on where another one was: with this checkpoint instead of the own, without
-        the tracks that have `ended` since, with the orders that it does not know, and above that one's generation and
-        epoch."""
+        the tracks that have `ended` since, with the orders that it does not know, and what was noted of tracks that
+        have begun, and above that one's generation and epoch."""
         self.held.inherit(orders)
         if checkpoint is not None:
-            self._heritage, self._inherits = (checkpoint, ended), True
+            self._heritage, self._inherits, self._inherited = (checkpoint, ended), True, born
         self._last, self.epoch_above = max(self._last, generation), max(self.epoch_above, epoch)
+
+    @property
+    def inherits(self) -> bool:
+        """Whether the service that begins goes on where another one was."""
+        return self._inherits
 
     @property
     def trouble(self) -> str:
@@ -219,7 +226,9 @@ class State:
 
     def born(self) -> bytes:
         """What was noted of tracks that have begun since the last checkpoint was made, one note after the other."""
-        return b"" if self._born is None or self._inherits else self._born.read()
+        if self._inherits:
+            return self._inherited
+        return b"" if self._born is None else self._born.read()
 
     def note_born(self, note: bytes) -> None:
         """Tracks have begun, which will be published: after kill -9 the note is in `born`. It must end with a byte that

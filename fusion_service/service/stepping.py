@@ -13,7 +13,7 @@ from __future__ import annotations
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,7 +23,6 @@ from fusion_service.centre import (
     Centre,
     ClockSet,
     Event,
-    LocalKey,
     Order,
     Refused,
     Skipped,
@@ -39,7 +38,7 @@ from fusion_service.service.isolating import TooManyTries, culprits
 from fusion_service.service.ordering import OrderDesk
 from fusion_service.service.state import State, StateError
 from fusion_service.service.syncing import sync_to_disk
-from fusion_service.service.young import born_in, noted
+from fusion_service.service.young import Born, born_in, noted, padded
 from schemas import Message, StepLog, encode, messages
 
 __all__ = ["SAVED_EVERY", "LastingCentre", "Made"]
@@ -89,6 +88,7 @@ class LastingCentre:
         self._desk = desk
         self._changed = self._fresh = False
         self._saved_at = float("-inf")
+        self._inherited = state.inherits
         self._checkpoint = self._usable(state.load())
         self._ended, self._born = [state.ended()], [state.born()]
         known = glance(self._checkpoint or b"").generation
@@ -128,7 +128,7 @@ class LastingCentre:
         if self._checkpoint is not None:
             ended, born = (
                 np.concatenate(self._ended),
-                born_in(b"".join(one.ljust(-(-len(one) // 8) * 8, b"\0") for one in self._born)),
+                born_in(b"".join(map(padded, self._born))),
             )
             self._checkpoint = without(self._config, self._checkpoint, ended, born)
         self._ended, self._born = [NONE], [b""]
@@ -232,14 +232,15 @@ class LastingCentre:
             self._keep(checkpoint)
         else:
             self._note_ended(np.array([track for track, _, _ in result.tracks.ended], dtype=np.uint64))
-            self._note_born(noted(result.picture, self._saved))
+            self._note_born(noted(result.picture, self._saved, self.centre.young))
         return Made(result, payloads)
 
     def _tell_sleep(self, at: int) -> None:
-        """The first step after a checkpoint: those between were not made."""
+        """The first step after a checkpoint: those between were not made. Who takes over has heard what came
+        meanwhile."""
         missed = (at - self.centre.time) // round(self._config.period * 1e9) - 1
         if self._slept and self.centre.time >= 0 and missed > 0:
-            self.centre.handle(Skipped(missed), time.time_ns())
+            self.centre.handle(Skipped(missed, absent=not self._inherited), time.time_ns())
         self._slept = False
 
     def _note_born(self, note: bytes) -> None:
@@ -324,6 +325,7 @@ class LastingCentre:
         except (OSError, StateError) as error:
             self._generation += 1
             self._told.error("cannot write an id generation: %s", error)
+        self._inherited = False
         self.centre = self._make_centre()
         self._restarted()
         for order in self._desk.again(self._checkpoint is None):
@@ -353,18 +355,16 @@ def _name_of(message: Message) -> tuple[str, str, int, int]:
     return source_of(message), message.type, message.epoch, message.seq
 
 
-def without(
-    config: CentreConfig, checkpoint: bytes, ended: NDArray[np.uint64], born: Sequence[tuple[LocalKey, int]] = ()
-) -> bytes:
+def without(config: CentreConfig, checkpoint: bytes, ended: NDArray[np.uint64], born: Born | None = None) -> bytes:
     """A checkpoint without the global tracks `ended`, and with the ids of those that were `born` after it; as it is
     where there are none, or it cannot be read."""
     over = set(ended.tolist())
-    born = [one for one in born if one[1] not in over]
-    if not len(ended) and not born:
+    tracks = [one for one in born.tracks if one[1] not in over] if born is not None else []
+    if not len(ended) and not tracks:
         return checkpoint
     centre, fault = make_centre(config, checkpoint)
     if fault:
         return checkpoint
     gone = centre.let_go(ended)
-    centre.promise(born)
-    return centre.checkpoint() if gone or born else checkpoint
+    centre.promise(tracks, born.where if born is not None else ())
+    return centre.checkpoint() if gone or tracks else checkpoint

@@ -13,6 +13,9 @@ step's log goes out before its picture: who sees a track in the picture sees it 
 order to hand over (`handover`): then the last step is published, a checkpoint held ready for who cannot follow,
 `yields/{term}.{step}` announced, and no step made any more; should nobody have taken over in `HANDOVER` seconds, it
 goes on.
+
+Where the bus was split, hubs have been seen to lose what was declared before, for good, as the link between them came
+and went (Zenoh's issue 1886). One that stands by, as its token says, and asks nothing, is told of `.../state` anew.
 """
 
 from __future__ import annotations
@@ -44,6 +47,8 @@ LOOK = 2.0
 """Seconds after which the hub is asked in any case, where another stands by."""
 FRESH = 2.0
 """Seconds for which one that stands by is there after it was heard."""
+UNHEARD = 5.0
+"""Seconds for which one that stands by may ask nothing, until it is told anew where to."""
 MOST = 8
 MOST_BYTES = 1000
 TOLD = 600.0
@@ -133,8 +138,8 @@ class Tenure:
         self._bus.announce(self._key("holds", str(term)))
         self._bus.watch(self._key("holds", "*"), self._on_term)
         self._bus.watch(self._key("standby", "*"), self._on_follower)
-        self._bus.answer(global_key(self._name, "state", self._realm), self._answer)
-        self._passed = self._heard = seconds()
+        self._answers = self._bus.answer(global_key(self._name, "state", self._realm), self._answer)
+        self._told_anew = self._passed = self._heard = seconds()
         log.info("active as %s, term %d", self._name, term)
 
     def vouch(self, promises: Promises) -> None:
@@ -274,6 +279,7 @@ class Tenure:
                 self._held = dict(list(self._held.items())[-MOST:]) | dict.fromkeys(names, held)
         if handing:
             self._yield(stop)
+        self._tell_anew()
         gone = self._gone()
         if gone or stop.is_set():
             self._handover.done(self._newer, "the service stops")
@@ -302,6 +308,19 @@ class Tenure:
         """Whether another holds the name."""
         self.may_publish()
         return bool(self._newer)
+
+    def _tell_anew(self) -> None:
+        """Declare the answers to questions once more, where one that stands by asks none."""
+        now = seconds()
+        with self._lock:
+            asking = {name for name, one in self._followers.items() if now - one.heard < UNHEARD}
+            if not self._there - asking:
+                self._told_anew = now
+        if now - self._told_anew > UNHEARD:
+            self._told_anew = now
+            self._answers.close()
+            self._answers = self._bus.answer(global_key(self._name, "state", self._realm), self._answer)
+            log.warning("one that stands by asks nothing: it is told anew where to")
 
     def _yield(self, stop: threading.Event) -> None:
         """Make no step until another has taken over, or the time for that is over."""

@@ -150,12 +150,12 @@ class Lab:
 
     def bus(self, party: str) -> Bus:
         """An honest session of a party."""
-        return self.stack.enter_context(open_bus([self.endpoint], wait=10.0, security=self.security(party)))
+        return self.stack.enter_context(open_bus([self.endpoint], wait=60.0, security=self.security(party)))
 
     def publisher(self, name: str) -> TrackPublisher:
         """An honest radar."""
         security = None if self.keys is None else self.keys / f"source-{name}"
-        return self.stack.enter_context(TrackPublisher(name, connect=self.endpoint, wait=10.0, security=security))
+        return self.stack.enter_context(TrackPublisher(name, connect=self.endpoint, wait=60.0, security=security))
 
     def raw(self, party: str, mode: str = "client") -> zenoh.Session:
         """A session that knows no manners, with the certificate of a party."""

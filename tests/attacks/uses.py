@@ -23,29 +23,29 @@ V1 = "fusion/v1"
 def source(lab: Lab) -> bool:
     """A radar's tracks reach the centre: they are in its picture."""
     lab.recorded.clear()
-    return lab.wait(lambda: lab.report() and lab.heard(f"{V1}/global/main/tracks", b"r1"), 3.0)
+    return lab.wait(lambda: lab.report() and lab.heard(f"{V1}/global/main/tracks", b"r1"), 20.0)
 
 
 def late_recorder(lab: Lab) -> bool:
     """Who joins later gets the last info of a radar that says nothing any more, and hears of its token."""
     heard: list[str] = []
     tokens: list[str] = []
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("recorder-rec")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("recorder-rec")) as bus:
         bus.subscribe(f"{V1}/**", lambda key, data: heard.append(key))
         bus.watch(f"{V1}/*/*/alive", lambda key, up: tokens.append(key))
         alive = {f"{V1}/local/r1/alive", f"{V1}/global/main/alive"}
-        return lab.wait(lambda: f"{V1}/local/r1/info" in heard and alive <= set(tokens), 3.0)
+        return lab.wait(lambda: f"{V1}/local/r1/info" in heard and alive <= set(tokens), 20.0)
 
 
 def viewer(lab: Lab) -> bool:
     """A viewer hears the picture, and asks for it."""
     heard: list[bytes] = []
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("viewer-wall")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("viewer-wall")) as bus:
         bus.subscribe(f"{V1}/global/*/tracks", lambda key, data: heard.append(data), history=0)
-        asked = bus.ask(f"{V1}/global/main/picture") + bus.ask(f"{V1}/global/*/picture")
+        asked = [found for who in ("main", "*") for found in bus.ask(f"{V1}/global/{who}/picture", timeout=20.0)]
         pictures = [schemas.decode(data) for _, data in asked]
         whole = len(pictures) == 2 and all(isinstance(one, schemas.GlobalTracks) for one in pictures)
-        return whole and lab.wait(lambda: bool(heard), 3.0)
+        return whole and lab.wait(lambda: bool(heard), 20.0)
 
 
 def _note(keys: list[str], key: str, data: bytes) -> None:
@@ -68,14 +68,14 @@ def recorder_seen(lab: Lab) -> bool:
     """A viewer sees that a recorder is there, and asks what it keeps."""
     tokens: list[str] = []
     with (
-        open_bus([lab.endpoint], wait=10.0, security=lab.security("recorder-rec")) as recorder,
-        open_bus([lab.endpoint], wait=10.0, security=lab.security("viewer-wall")) as bus,
+        open_bus([lab.endpoint], wait=60.0, security=lab.security("recorder-rec")) as recorder,
+        open_bus([lab.endpoint], wait=60.0, security=lab.security("viewer-wall")) as bus,
     ):
         recorder.announce(f"{V1}/record/rec/alive")
         recorder.answer(f"{V1}/record/rec/state", lambda _: b"kept")
         bus.watch(f"{V1}/record/*/alive", lambda key, up: tokens.append(key))
         return lab.wait(
-            lambda: bool(tokens) and [(f"{V1}/record/rec/state", b"kept")] == bus.ask(f"{V1}/record/*/state"), 3.0
+            lambda: bool(tokens) and [(f"{V1}/record/rec/state", b"kept")] == bus.ask(f"{V1}/record/*/state"), 20.0
         )
 
 
@@ -93,22 +93,22 @@ def operator(lab: Lab) -> bool:
         lab.endpoint,
         *security,
     ]
-    done = subprocess.run([*command, "quarantine", "--source", "r1"], capture_output=True, text=True, timeout=20)
+    done = subprocess.run([*command, "quarantine", "--source", "r1"], capture_output=True, text=True, timeout=120)
     key = schemas.order_key("main", "alice")
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("operator-alice")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("operator-alice")) as bus:
 
         def stands() -> bool:
-            (answer,) = bus.ask(key, msgpack.packb({"what": "list"}))
+            (answer,) = bus.ask(key, msgpack.packb({"what": "list"}), 20.0)
             orders = msgpack.unpackb(answer[1])["orders"]
             return any(one["what"] == "quarantine" and (lab.keys is None or one["who"] == "alice") for one in orders)
 
-        return done.returncode == 0 and lab.wait(stands, 3.0)
+        return done.returncode == 0 and lab.wait(stands, 20.0)
 
 
 def gateway(lab: Lab) -> bool:
     """A gateway publishes as a source, and reads the picture."""
     heard: list[bytes] = []
-    with open_bus([lab.endpoint], wait=10.0, security=lab.security("gateway-gate")) as bus:
+    with open_bus([lab.endpoint], wait=60.0, security=lab.security("gateway-gate")) as bus:
         bus.subscribe(f"{V1}/global/main/tracks", lambda key, data: heard.append(data))
         publisher = bus.publisher(f"{V1}/local/gate/tracks")
 
@@ -116,18 +116,18 @@ def gateway(lab: Lab) -> bool:
             publisher.put(b"gate")
             return bool(heard) and lab.heard(f"{V1}/local/gate/tracks", b"gate")
 
-        return lab.wait(both, 3.0)
+        return lab.wait(both, 20.0)
 
 
 def service_again(lab: Lab) -> bool:
     """The service is killed, and a new one fuses: it gets the radars' info from their caches."""
     lab.service.send_signal(signal.SIGKILL)
     lab.service.wait()
-    if not lab.wait(lambda: (f"{V1}/global/main/alive", False) in lab.tokens, 3.0):
+    if not lab.wait(lambda: (f"{V1}/global/main/alive", False) in lab.tokens, 20.0):
         return False
     lab.start_service()
     lab.recorded.clear()
-    return lab.wait(lambda: lab.report() and lab.heard(f"{V1}/global/main/tracks", b"r1"), 12.0)
+    return lab.wait(lambda: lab.report() and lab.heard(f"{V1}/global/main/tracks", b"r1"), 60.0)
 
 
 USES: dict[str, Callable[[Lab], bool]] = {

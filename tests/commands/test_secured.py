@@ -19,7 +19,7 @@ SERVICE = "import sys; from fusion_service.cli import main; sys.exit(main(sys.ar
 
 def command(module: str, *words: str | Path) -> tuple[int, str]:
     line = [sys.executable, "-m", module, *map(str, words)]
-    done = subprocess.run(line, capture_output=True, text=True, timeout=30, check=False)
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120, check=False)
     return done.returncode, done.stdout + done.stderr
 
 

@@ -18,7 +18,7 @@ import pytest
 
 from fusion_service.config import load_config
 from tests.docs.pages import ROOT, blocks
-from tests.helpers.processes import free_endpoint
+from tests.helpers.processes import free_endpoint, slowness
 
 BLOCKS = blocks("docs/tutorial.md")
 COMMANDS = {"python": "", "fusion-service": "-m fusion_service", "sensor-client": "-m sensor_clients"}
@@ -64,7 +64,7 @@ def test_the_tutorial_runs_as_it_stands(tmp_path: Path) -> None:
         command, cwd=folder, env=environment, stdout=pipe, stderr=pipe, text=True, start_new_session=True
     )
     try:
-        out, errors = shell.communicate(timeout=150)
+        out, errors = shell.communicate(timeout=150 * slowness())
     finally:
         with suppress(ProcessLookupError):
             os.killpg(shell.pid, signal.SIGKILL)

@@ -41,7 +41,7 @@ class Watch:
         self.logs: list[StepLog] = []
         self.alive: list[bool] = []
         self._wholes = schemas.Wholes()
-        self.bus = stack.enter_context(open_bus([endpoint], wait=10.0))
+        self.bus = stack.enter_context(open_bus([endpoint], wait=60.0))
         self.bus.watch(schemas.global_key("*", "alive"), lambda key, alive: self.alive.append(alive))
         for what in ("tracks", "log", "status"):
             self.bus.subscribe(schemas.global_key("*", what), self._take)
@@ -62,7 +62,7 @@ class Watch:
     def sees(self, *targets: int) -> bool:
         return bool(self.pictures) and sorted(self.pictures[-1].targets) == sorted(targets)
 
-    def taken_over(self, since: int, timeout: float = 10.0) -> Seen:
+    def taken_over(self, since: int, timeout: float = 20.0) -> Seen:
         """The first picture of another run than that of number `since` of the pictures."""
         epoch = self.pictures[since].picture.epoch
         found: list[Seen] = []
@@ -151,6 +151,6 @@ class Pair:
         """Which of the two is active, by the parity of its term's node: they are 0 and 1."""
         return self.watch.term() % 4
 
-    def taken_over(self, since: int, timeout: float = 10.0) -> Seen:
+    def taken_over(self, since: int, timeout: float = 20.0) -> Seen:
         """The first picture of another run than that of number `since` of the pictures, at the first hub."""
         return self.watch.taken_over(since, timeout)

@@ -102,7 +102,7 @@ class Scene:
         self.endpoint = hub.endpoint
         self.folder = folder
         self._stack = stack
-        self.bus = stack.enter_context(open_bus([hub.endpoint], wait=10.0))
+        self.bus = stack.enter_context(open_bus([hub.endpoint], wait=60.0))
         self.seen = Observer(self.bus)
         self.running: Program | None = None
 

@@ -20,7 +20,7 @@ frame = {"kind": "enu", "lat": 63.43, "lon": 10.39}
 P = np.diag([25.0, 25.0, 1.0, 1.0])
 P[0, 2] = P[2, 0] = P[1, 3] = P[3, 1] = 2.0
 L = np.linalg.cholesky(P)
-with open_bus([endpoint], wait=10.0) as bus, open(gps, "w") as truth:
+with open_bus([endpoint], wait=60.0) as bus, open(gps, "w") as truth:
     bus.announce("fusion/v1/local/newcomer/alive")
     out = {what: bus.publisher("fusion/v1/local/newcomer/" + what) for what in ("tracks", "info")}
     print("time,id,x,y", file=truth)

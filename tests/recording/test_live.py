@@ -107,8 +107,8 @@ def test_a_viewer_that_never_reads_holds_nothing_up(
         closing = time.monotonic() - begin
     assert (live.dropped > 0) == (how == "stopped viewer")
     assert live._held <= module.HELD
-    assert max(ticks) < 2.0
-    assert closing < 5.0
+    assert max(ticks) < 10.0, "for ever where it waits for a viewer"
+    assert closing < 10.0
     assert [raw.data for raw in read(tmp_path / "a.rrd")] == [data for _, data in coded]
 
 

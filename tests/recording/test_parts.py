@@ -351,7 +351,7 @@ sys.path.insert(0, sys.argv[3])
 from fusion_service.bus import open_bus
 from tests.recording.mission import mission
 count = int(sys.argv[2])
-with open_bus([sys.argv[1]], wait=10) as bus:
+with open_bus([sys.argv[1]], wait=60.0) as bus:
     said = [sent for sent in mission(count)]
     publishers = {}
     for sent in said:
@@ -390,7 +390,7 @@ def test_the_process_loses_nothing_when_it_rotates_under_load_and_is_killed(hub:
         assert [raw.data for raw in found if raw.key == key] == [sent.data for sent in said if sent.key == key]
     assert all(a.received <= b.received for a, b in pairwise(found) if a.key == b.key)
     count = len(parts(folder))
-    with Program(run) as recorder, open_bus([hub.endpoint], wait=10):
+    with Program(run) as recorder, open_bus([hub.endpoint], wait=60.0):
         eventually(lambda: len(parts(folder)) > count, 20)
         recorder.signal(signal.SIGTERM)
         assert recorder.end()[0] == 0

@@ -191,7 +191,7 @@ def test_exported_tracks_are_played_back_on_the_bus(
     out = tmp_path / "tracks.csv"
     assert main(["export", str(path), "--out", str(out)]) == 0
     heard: list[Message] = []
-    with open_bus([hub.endpoint], wait=10) as bus:
+    with open_bus([hub.endpoint], wait=60.0) as bus:
         bus.subscribe("fusion/v1/local/*/tracks", lambda key, data: heard.append(schemas.decode(data)), history=8)
         arguments = ("playback", str(out), "--sensor", "centre", "--speed", "100", "--connect", hub.endpoint)
         with Program(CLIENT, *arguments) as client:

@@ -36,7 +36,7 @@ P = np.diag([25.0, 1.0, 25.0, 1.0])
 @pytest.fixture
 def listener(hub: Hub) -> Iterator[tuple[Bus, list[tuple[str, Message]]]]:
     got: list[tuple[str, Message]] = []
-    with open_bus([hub.endpoint], wait=10) as bus:
+    with open_bus([hub.endpoint], wait=60.0) as bus:
         bus.subscribe("**", lambda key, data: got.append((key, decode(data))), history=8)
         yield bus, got
 
@@ -130,13 +130,13 @@ def test_what_is_published_arrives_with_its_header(hub: Hub, listener: tuple[Bus
 
 
 def test_a_late_joiner_gets_the_current_info_and_tracks(hub: Hub) -> None:
-    with TrackPublisher("radar-1", connect=hub.endpoint, wait=10) as radar:
+    with TrackPublisher("radar-1", connect=hub.endpoint, wait=60.0) as radar:
         for period in (1.0, 2.0):
             radar.info(frame=SITE, position=(0, 0, 0), period=period, motion=Motion("cv", 0.5))
         for i in range(3):
             radar.tracks(**scan(time=i))
         got: list[Message] = []
-        with open_bus([hub.endpoint], wait=10) as bus:
+        with open_bus([hub.endpoint], wait=60.0) as bus:
             bus.subscribe("fusion/v1/local/*/*", lambda key, data: got.append(decode(data)))
             eventually(lambda: len(got) == 2)
     assert {message.seq for message in got if isinstance(message, SensorInfo)} == {1}
@@ -147,7 +147,7 @@ def test_alive_while_open_and_a_new_epoch_each_time(hub: Hub, listener: tuple[Bu
     bus, got = listener
     alive: list[tuple[str, bool]] = []
     bus.watch("fusion/v1/local/*/alive", lambda key, up: alive.append((key, up)))
-    radar = TrackPublisher("radar-1", connect=[hub.endpoint], wait=10)
+    radar = TrackPublisher("radar-1", connect=[hub.endpoint], wait=60.0)
     key = "fusion/v1/local/radar-1/alive"
     for count in (1, 2):
         with radar:
@@ -164,7 +164,7 @@ def test_alive_while_open_and_a_new_epoch_each_time(hub: Hub, listener: tuple[Bu
 
 def test_publications_resume_after_the_hub_died(hub: Hub, listener: tuple[Bus, list[tuple[str, Message]]]) -> None:
     _, got = listener
-    with TrackPublisher("radar-1", connect=hub.endpoint, wait=10) as radar:
+    with TrackPublisher("radar-1", connect=hub.endpoint, wait=60.0) as radar:
         radar.tracks(**scan())
         eventually(lambda: len(got) == 1)
         hub.kill()
@@ -207,7 +207,7 @@ def test_what_the_centre_would_refuse_is_refused_here_and_never_sent(
     hub: Hub, listener: tuple[Bus, list[tuple[str, Message]]]
 ) -> None:
     _, got = listener
-    with TrackPublisher("radar-1", connect=hub.endpoint, wait=10) as radar:
+    with TrackPublisher("radar-1", connect=hub.endpoint, wait=60.0) as radar:
         for name, (reason, changes, says) in BAD_TRACKS.items():
             with pytest.raises(MessageError, match=says) as caught:
                 radar.tracks(**scan(**changes))
@@ -227,7 +227,7 @@ def test_covariances_that_rounding_made_slightly_asymmetric_pass(hub: Hub) -> No
     root = rng.normal(size=(4, 4))
     covariance = root @ root.T + np.eye(4)
     covariance[0, 1] *= 1 + 1e-12
-    with TrackPublisher("radar-1", connect=hub.endpoint, wait=10) as radar:
+    with TrackPublisher("radar-1", connect=hub.endpoint, wait=60.0) as radar:
         sent = radar.tracks(**scan(covariances=[covariance] * 2))
     assert sent.seq == 0
 
@@ -240,7 +240,7 @@ def test_bad_names_are_refused_before_anything_is_opened(name: str, origin: str)
 
 def test_truth(hub: Hub, listener: tuple[Bus, list[tuple[str, Message]]]) -> None:
     _, got = listener
-    with TruthPublisher("three-radars", connect=hub.endpoint, origin="simulated", wait=10) as scenario:
+    with TruthPublisher("three-radars", connect=hub.endpoint, origin="simulated", wait=60.0) as scenario:
         scenario.truth(time=5, space=("x", "y"), frame=SITE, ids=[1, 2], means=[[1, 2], [3, 4]])
         with pytest.raises(MessageError, match="finite"):
             scenario.truth(time=6, space=("x", "y"), frame=SITE, ids=[1], means=[[1, np.inf]])

@@ -50,7 +50,7 @@ def test_scans_are_stepped_as_they_come_and_a_reader_has_the_whole_picture(scene
     }
     assert confirmed() == 3
     assert newest is not None
-    [(_, data)] = scene.bus.ask(schemas.global_key("centre", "picture"))
+    [(_, data)] = scene.bus.ask(schemas.global_key("centre", "picture"), timeout=20.0)
     picture = schemas.decode(data)
     assert isinstance(picture, GlobalTracks)
     assert not picture.delta

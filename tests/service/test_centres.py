@@ -60,7 +60,7 @@ class Centres:
         self.pictures: dict[str, list[GlobalTracks]] = {name: [] for name in realm}
         self.sensors: dict[str, Program] = {}
         self.services: dict[str, Program] = {}
-        bus = stack.enter_context(open_bus([hub.endpoint], wait=10.0))
+        bus = stack.enter_context(open_bus([hub.endpoint], wait=60.0))
         bus.subscribe(schemas.global_key("*", "tracks"), self._take)
         for name, others in realm.items():
             own = {f"s{name}"} if name in SENSORS else set()

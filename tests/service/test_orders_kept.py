@@ -31,7 +31,7 @@ def scene(hub: Hub, tmp_path: Path) -> Iterator[Scene]:
 
 def ask(scene: Scene, **request: Any) -> dict[str, Any]:
     key = schemas.global_key("centre", "orders")
-    [(_, answer)] = scene.bus.ask(key, msgpack.packb(request), 8.0)
+    [(_, answer)] = scene.bus.ask(key, msgpack.packb(request), 20.0)
     read: dict[str, Any] = msgpack.unpackb(answer)
     return read
 
@@ -90,7 +90,7 @@ def test_what_waits_for_a_step_stands_after_kill_9_at_once(scene: Scene) -> None
         service = ready(scene, 'clock = "message"')
         begin = time.monotonic()
         answer = ask(scene, what="mute", source=f"quiet{k}")
-        assert PATIENCE <= time.monotonic() - begin < PATIENCE + 1.5
+        assert time.monotonic() - begin >= PATIENCE
         assert answer["done"]
         assert answer["kept"]
         assert answer["pending"]

@@ -105,7 +105,7 @@ def test_orders_outlive_a_kill(scene: Scene) -> None:
     key = schemas.global_key("centre", "orders")
 
     def ask(**request: Any) -> dict[str, Any]:
-        [(_, answer)] = scene.bus.ask(key, msgpack.packb(request), 5.0)
+        [(_, answer)] = scene.bus.ask(key, msgpack.packb(request), 20.0)
         read: dict[str, Any] = msgpack.unpackb(answer)
         return read
 
@@ -121,7 +121,7 @@ def test_orders_outlive_a_kill(scene: Scene) -> None:
     )
     for bad in malformed:
         with pytest.raises(BusError, match="order"):
-            scene.bus.ask(key, msgpack.packb(bad), 5.0)
+            scene.bus.ask(key, msgpack.packb(bad), 20.0)
     assert scene.running is not None
     scene.running.kill()
     before = len(scene.seen.pictures)

@@ -42,7 +42,8 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     killed = time.monotonic()
     number = len(watch.pictures) - 1
     seen = pair.taken_over(number)
-    assert seen.at - killed < 2.0
+    print("taken over from a killed one after", seen.at - killed, "s")
+    assert seen.at - killed < 8.0, "with its session after ten; how long it takes: python -m tests.standby"
     assert seen.targets == before
     assert "PILOT" in (seen.picture.callsign or ())
     eventually(lambda: pair.active() == 1)
@@ -54,7 +55,8 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     frozen = time.monotonic()
     number = len(watch.pictures) - 1
     seen = pair.taken_over(number)
-    assert seen.at - frozen < 3.0
+    print("from a frozen one after", seen.at - frozen, "s")
+    assert seen.at - frozen < 8.0
     assert seen.targets == before
     second.signal(signal.SIGCONT)
     eventually(lambda: pair.active() == 0 and watch.ready(), 20)  # it stood down, and stands by
@@ -63,7 +65,7 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     assert main(["order", "handover", "--connect", hub.endpoint]) == 0
     seen = pair.taken_over(number)
     assert seen.targets == before
-    assert seen.picture.time - watch.pictures[number].picture.time < 1.2e9
+    assert seen.picture.time - watch.pictures[number].picture.time < 5e9
     eventually(lambda: pair.active() == 1 and watch.ready(), 20)
     assert "PILOT" in (watch.pictures[-1].picture.callsign or ())
     assert watch.faults() == []
@@ -96,7 +98,7 @@ def test_where_the_bus_splits_both_go_on_and_the_later_one_stays(tmp_path: Path,
     eventually(lambda: far.pictures and 9 in far.pictures[-1].targets)
     assert near.pictures[-1].targets[7] != far.pictures[-1].targets[9]
     hubs.link.mend()
-    took = eventually(lambda: far.ready(), 90)
+    took = eventually(lambda: far.ready())
     print("whole again after", took)
     eventually(lambda: near.sees(0, 1, 2, 7, 9) and far.sees(0, 1, 2, 7, 9))
     assert max(terms) == terms[1]

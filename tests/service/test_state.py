@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion_service.centre import FusionCentre
+from fusion_service.centre import FusionCentre, Whereabouts
 from fusion_service.service import state as state_module
 from fusion_service.service.state import StateError, open_state
 from fusion_service.service.young import born_in, noted
@@ -147,8 +147,8 @@ def test_a_full_disk_at_the_start_is_told_and_no_id_is_given_twice(
             if known:
                 assert state.load() == b"checkpoint"
                 state.note_ended(ended)
-                state.note_born(noted(picture(), 5))
-                assert born_in(state.born())[0] == (("r1", 7, 70), 700)
+                state.note_born(noted(picture(), 5, nowhere))
+                assert born_in(state.born()).tracks[0] == (("r1", 7, 70), 700)
                 assert ended.tolist() == state.ended()[-1000:].tolist()
     assert taken == sorted(set(taken))
     assert "full disk" in caplog.text
@@ -159,7 +159,7 @@ def test_a_full_disk_at_the_start_is_told_and_no_id_is_given_twice(
         assert state.trouble == ""
         assert state.load() == b"new"
         assert not len(state.ended())
-        assert born_in(state.born()) == []
+        assert born_in(state.born()) == ([], [])
 
 
 def test_where_files_may_not_grow_the_service_starts_too(tmp_path: Path) -> None:
@@ -246,18 +246,23 @@ def picture() -> GlobalTracks:
     )
 
 
+def nowhere(above: int) -> Whereabouts:
+    """Where they are, of tracks that have no place."""
+    return Whereabouts.nothing(above % 5)
+
+
 def test_notes_of_what_begins_are_read_up_to_where_they_are_torn(tmp_path: Path) -> None:
     with open_state(str(tmp_path)) as state:
         for above in (0, 5, 700):
-            state.note_born(noted(picture(), above))
+            state.note_born(noted(picture(), above, nowhere))
     with open_state(str(tmp_path)) as state:
-        state.note_born(noted(picture(), 699))  # of a later process, behind the others
+        state.note_born(noted(picture(), 699, nowhere))  # of a later process, behind the others
         data = state.born()
     young = [(("r1", 7, 70), 700), (("r2", 9, 2**63), 700)]
     whole = [(("r2", 9, 1), 5), *young, *young, *young]
-    assert born_in(data) == whole
+    assert born_in(data).tracks == whole
     for cut in range(len(data)):
-        part = born_in(data[:cut])
+        part = born_in(data[:cut]).tracks
         assert part == whole[: len(part)]
-        assert born_in(data[:cut] + bytes(64)) == part
-        assert isinstance(born_in(data[:cut] + b"\xff" * 64), list)
+        assert born_in(data[:cut] + bytes(64)).tracks == part
+        assert isinstance(born_in(data[:cut] + b"\xff" * 64).tracks, list)

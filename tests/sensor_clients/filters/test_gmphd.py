@@ -197,7 +197,7 @@ def test_an_intensity_reaches_the_bus(hub: Hub) -> None:
     heard: list[tuple[str, schemas.Message]] = []
     main = "import sys; from sensor_clients.cli import main; sys.exit(main(sys.argv[1:]))"
     common = ("simulate", "three-radars", "--sensor", "radar3", "--tracker", "gm-phd", "--connect", hub.endpoint)
-    with open_bus([hub.endpoint], wait=10) as bus:
+    with open_bus([hub.endpoint], wait=60.0) as bus:
         bus.subscribe("**", lambda key, data: heard.append((key, schemas.decode(data))), history=8)
         with Program(main, *common, "--speed", "100", "--duration", "30", "--seed", "2") as radar:
             assert radar.end(20) == (0, "")

@@ -172,7 +172,7 @@ def test_a_camera_of_a_recording_reaches_the_bus(hub: Hub, tmp_path: Path) -> No
     heard: list[schemas.Message] = []
     main = "import sys; from sensor_clients.cli import main; sys.exit(main(sys.argv[1:]))"
     common_options = ("--sensor", "eo", "--data", str(tmp_path), "--connect", hub.endpoint, "--speed", "20")
-    with open_bus([hub.endpoint], wait=10) as bus:
+    with open_bus([hub.endpoint], wait=60.0) as bus:
         bus.subscribe("**", lambda key, data: heard.append(schemas.decode(data)), history=8)
         with Program(main, "playback", "autoferry:2", *common_options) as camera:
             assert camera.end(20) == (0, "")
