@@ -103,7 +103,7 @@ def test_all_join_the_hub_on_a_network_without_a_way_out() -> None:
     (listen,) = arguments("hub").listen
     endpoint = f"tcp/hub:{listen.rpartition(':')[2]}"
     assert listen.startswith("tcp/0.0.0.0:")
-    assert {arguments(name).connect for name in CLIENTS} == {endpoint}
+    assert all(arguments(name).connect == [endpoint] for name in CLIENTS)
     assert arguments("record").connect == arguments("metrics").connect == [endpoint]
     assert load_config(DOCKER / "centre.toml").bus.connect == (endpoint,)
     for name, one in SERVICES.items():

@@ -53,7 +53,7 @@ assert signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_while_modules_are_loaded_ends_it_quietly(number: signal.Signals) -> None:
-    with Program(SLOW_IMPORT, "run", "--connect", "tcp/127.0.0.1:1") as program:
+    with Program(SLOW_IMPORT, "run", "--connect", "tcp/127.0.0.1:1", fresh=True) as program:
         assert program.line() == "importing"
         program.signal(number)
         code, errors = program.end()  # closes its stdin: the import goes on
@@ -68,7 +68,7 @@ def test_a_signal_while_the_compiler_loads_ends_it_too(tmp_path: Path, monkeypat
         programs = []
         for choice in ("on", "auto"):
             monkeypatch.setenv(VARIABLE, choice)
-            programs.append(stack.enter_context(Program(COMMAND, "run", "--connect", "tcp/127.0.0.1:1")))
+            programs.append(stack.enter_context(Program(COMMAND, "run", "--connect", "tcp/127.0.0.1:1", fresh=True)))
         for program in programs:
             assert program.line(20.0) == "loading"
             program.signal(signal.SIGTERM)
