@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import logging
+import re
 import time
 from collections.abc import Mapping
 
-__all__ = ["BoundedLog"]
+__all__ = ["BoundedLog", "uncounted"]
 
 LOUD = 10.0
 """Seconds between two lines of the same words about what is wrong."""
@@ -15,6 +16,11 @@ MOST_TOLD = 1000
 """Words that are remembered: sources write some of them."""
 
 log = logging.getLogger(__name__)
+
+
+def uncounted(note: str) -> str:
+    """A note that ends by how many, without that: the same note, however many it has come to."""
+    return re.sub(r": \d+ .*", "", note)
 
 
 class BoundedLog:

@@ -32,7 +32,7 @@ from fusion_service.centre import (
 from fusion_service.compiled import begin
 from fusion_service.config import ConfigError, ServiceConfig
 from fusion_service.process import loading
-from fusion_service.service.bounded import BoundedLog
+from fusion_service.service.bounded import BoundedLog, uncounted
 from fusion_service.service.complaints import Complaints
 from fusion_service.service.flow import Flow
 from fusion_service.service.heartbeat import Heartbeat
@@ -334,7 +334,7 @@ class Service:
         self._tenure.stepped(made.result.log.step, at, self._lasting.centre.epoch, self._lasting.generation)
         self._status.published(at, time.time_ns())
         notes = made.result.status.notes
-        if notes and self._told.allows(notes[0], 600.0):
+        if notes and self._told.allows(uncounted(notes[0]), 600.0):
             log.warning("%s", "; ".join(notes))
         self._tell_sources(made.result.log)
         self._complaints.stepped(made.result.log)
