@@ -105,7 +105,8 @@ def test_a_service_killed_and_started_again_is_verified_from_its_recording(hub: 
         assert program.end(60) == (0, "")
     told = json.loads(result.read_text())
     assert told["verify"]["compared"] >= 20
-    assert told["remarks"] == []
+    assert all(one.endswith("a step has no log") for one in told["remarks"]), "killed between a picture and its log"
+    assert len(told["remarks"]) <= 1
     assert told["variants"][0]["config"]["rule"] == "hmd-ga"
 
 
