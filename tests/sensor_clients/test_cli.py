@@ -60,7 +60,7 @@ def test_a_signal_ends_it(hub: Hub, heard: list[tuple[str, Message]], number: si
     with Program(MAIN, "simulate", "three-radars", "--sensor", "radar2", "--connect", hub.endpoint) as client:
         eventually(lambda: heard, 20)
         client.signal(number)
-        assert client.end() == (0, "")
+        assert client.end(3) == (0, "")
 
 
 def test_a_signal_ends_the_wait_for_a_hub() -> None:
@@ -69,7 +69,7 @@ def test_a_signal_ends_the_wait_for_a_hub() -> None:
         assert pipe is not None
         assert b"waiting for the hub" in pipe.readline()
         client.signal(signal.SIGTERM)
-        assert client.end()[0] == 0
+        assert client.end(5)[0] == 0
 
 
 @pytest.mark.parametrize(

@@ -63,7 +63,7 @@ def test_the_service_fuses_intensities_refuses_tracks_and_comes_back_after_kill_
     eventually(lambda: len(scene.seen.pictures) > killed and scene.seen.sees(0, 1, 2, 5)())
     assert scene.seen.confirmed() == before
     service.signal(signal.SIGTERM)
-    assert service.end()[0] == 0
+    assert service.end(timeout=5.0)[0] == 0
 
 
 def test_a_state_of_the_other_kind_is_set_aside(scene: Scene) -> None:
@@ -71,12 +71,12 @@ def test_a_state_of_the_other_kind_is_set_aside(scene: Scene) -> None:
     service = scene.service()
     eventually(scene.seen.sees(1))
     service.signal(signal.SIGTERM)
-    assert service.end()[0] == 0
+    assert service.end(timeout=5.0)[0] == 0
     sensor = scene.start(SENSOR, scene.endpoint, "r1", "9000", "2")
     assert sensor.line() == "up"
     service = scene.service('kind = "intensity"')
     eventually(scene.seen.sees(2))
     service.signal(signal.SIGTERM)
-    code, text = service.end()
+    code, text = service.end(timeout=5.0)
     assert code == 0
     assert "fuses tracks, not intensity" in text

@@ -15,7 +15,7 @@ import pytest
 import schemas
 from fusion_service.bus import open_bus
 from schemas.messages import GlobalTracks
-from tests.helpers.processes import Hub, Program, eventually, free_endpoint
+from tests.helpers.processes import Hub, Program, eventually, free_endpoint, slowness
 from tests.helpers.scene import COMMAND, CONFIG, SENSOR, Observer, Scene, opened
 
 
@@ -35,7 +35,7 @@ def test_a_killed_sensor_is_told_at_once_and_others_keep_its_targets(scene: Scen
     eventually(lambda: scene.said_of("r2", "alive") is False)
     at = next(at for at, one in scene.seen.statuses if one.sources.get("r2", {}).get("alive") is False)
     print("a killed sensor is told after", at - killed, "s")
-    assert at - killed < 8.0, "by its silence alone after ten"
+    assert at - killed < 1.0 * slowness(), "by its silence alone after ten"
     count = len(scene.seen.pictures)
     eventually(lambda: scene.said_of("r2", "stale"))
     eventually(lambda: scene.seen.feeders(before[2]) == {"r1", "r3"})
@@ -60,7 +60,7 @@ def test_the_picture_comes_back_after_kill_9_with_the_same_ids(scene: Scene) -> 
     assert len(born) == len(set(born))
     assert scene.seen.confirmed()[7] not in before.values()
     service.signal(signal.SIGTERM)
-    assert service.end()[0] == 0
+    assert service.end(timeout=5.0)[0] == 0
     scene.service()
     eventually(lambda: scene.seen.pictures[-1].epoch != scene.seen.pictures[killed].epoch)
     eventually(scene.seen.sees(0, 1, 2, 3, 7))
@@ -256,7 +256,7 @@ def test_ctrl_c_ends_everything_at_once(tmp_path: Path) -> None:
         eventually(lambda: recording.exists() and seen.sees(0)(), 20)
         for program in reversed(programs):
             program.signal(signal.SIGINT)
-            assert program.end(10.0)[0] == 0
+            assert program.end(5.0)[0] == 0
     from fusion_service.recording import messages
 
     kinds = {type(message).__name__ for message in messages(recording)}

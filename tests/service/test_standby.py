@@ -13,7 +13,7 @@ import pytest
 from fusion_service.cli import main
 from tests.helpers.link import Hubs
 from tests.helpers.pair import Pair, Watch
-from tests.helpers.processes import Hub, Program, eventually
+from tests.helpers.processes import Hub, Program, eventually, slowness
 
 TARGETS = (0, 1, 2, 3)
 
@@ -43,7 +43,7 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     number = len(watch.pictures) - 1
     seen = pair.taken_over(number)
     print("taken over from a killed one after", seen.at - killed, "s")
-    assert seen.at - killed < 8.0, "with its session after ten; how long it takes: python -m tests.standby"
+    assert seen.at - killed < 2.0 * slowness(), "with its session after ten"
     assert seen.targets == before
     assert "PILOT" in (seen.picture.callsign or ())
     eventually(lambda: pair.active() == 1)
@@ -56,7 +56,7 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     number = len(watch.pictures) - 1
     seen = pair.taken_over(number)
     print("from a frozen one after", seen.at - frozen, "s")
-    assert seen.at - frozen < 8.0
+    assert seen.at - frozen < 3.0 * slowness()
     assert seen.targets == before
     second.signal(signal.SIGCONT)
     eventually(lambda: pair.active() == 0 and watch.ready(), 20)  # it stood down, and stands by
@@ -65,7 +65,7 @@ def test_killed_frozen_and_told_the_other_goes_on_and_back(hub: Hub, tmp_path: P
     assert main(["order", "handover", "--connect", hub.endpoint]) == 0
     seen = pair.taken_over(number)
     assert seen.targets == before
-    assert seen.picture.time - watch.pictures[number].picture.time < 5e9
+    assert seen.picture.time - watch.pictures[number].picture.time < 1.2e9 * slowness()
     eventually(lambda: pair.active() == 1 and watch.ready(), 20)
     assert "PILOT" in (watch.pictures[-1].picture.callsign or ())
     assert watch.faults() == []
